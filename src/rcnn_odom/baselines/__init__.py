@@ -1,0 +1,1 @@
+"""Estimators that are not trained networks, behind the same interface."""

@@ -1,0 +1,43 @@
+"""Trained networks from disk, never trusting the file with more than numbers."""
+
+import pickle
+from pathlib import Path
+from zipfile import BadZipFile
+
+import torch
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.modules import VARIANTS, OdometryModule
+from rcnn_odom.scan import Sensor
+
+
+def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | None = None) -> OdometryModule:
+    """The trained module of a checkpoint, on the CPU, in evaluation mode.
+
+    Args:
+        path: a ``.ckpt`` file of a run.
+        variant: which of the four it must be; None for any.
+        sensor: which it must have been trained for; None for any.
+
+    Raises:
+        InputError: no such file, not a checkpoint of this project, of another variant or sensor.
+    """
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True)
+        settings, weights = saved["hyper_parameters"], saved["state_dict"]
+        found = settings["variant"]
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such checkpoint") from None
+    except (pickle.UnpicklingError, RuntimeError, EOFError, BadZipFile, OSError, KeyError, TypeError) as error:
+        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        raise InputError(f"{path}: not a checkpoint of this project ({reason})") from error
+    if variant is not None and found != variant:
+        raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
+    if sensor is not None and settings["sensor"] != sensor.as_dict():
+        raise InputError(
+            f"{path}: trained for {Sensor(**settings['sensor'])}, but the data has {sensor}; "
+            "set data.sensor as in training, or train on this data"
+        )
+    module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
+    module.load_state_dict(weights)
+    return module.eval()

@@ -1,0 +1,277 @@
+"""The one DataModule that every variant shares: windows of pairs to train on, whole drives to score."""
+
+import logging
+import math
+import os
+import re
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import numpy as np
+import torch
+from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
+
+from rcnn_odom.cache import EncodedSequence, encode_sequences
+from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import FloatArray
+from rcnn_odom.scan import Sensor
+
+log = logging.getLogger(__name__)
+
+Batch = dict[str, torch.Tensor]
+Draw = tuple[int, int, bool]
+"""What the sampler decides about one window: its first frame, a seed for the turns, mirrored or not."""
+
+
+class Windows(Dataset):
+    """Windows of consecutive pairs of scans out of drives laid end to end.
+
+    Args:
+        sequences: the drives.
+        sensor: theirs.
+        length: pairs in a window; 1 gives the CNNs their single pairs.
+        max_turn_bins: the second scan of each pair is turned by up to so many whole bins, and the true
+            heading change with it; both stay exact. 0: never.
+    """
+
+    def __init__(
+        self, sequences: list[EncodedSequence], sensor: Sensor, length: int, max_turn_bins: int = 0
+    ) -> None:
+        self.sequences, self.sensor, self.length = sequences, sensor, length
+        self.max_turn_bins = max_turn_bins
+        self.first_frames = np.cumsum([0] + [len(sequence) for sequence in sequences])
+
+    def __getitems__(self, draws: list[Draw]) -> Batch:
+        """A batch: ``pairs`` (B, T, 2, bins) in metres, ``motions`` (B, T, 2) in metres and radians."""
+        pairs, motions = zip(*(self._window(*draw) for draw in draws), strict=True)
+        return {
+            "pairs": torch.from_numpy(np.stack(pairs)),
+            "motions": torch.from_numpy(np.stack(motions).astype(np.float32)),
+        }
+
+    def _window(self, frame: int, seed: int, mirror: bool) -> tuple[np.ndarray, FloatArray]:
+        number = int(np.searchsorted(self.first_frames, frame, side="right")) - 1
+        sequence, start = self.sequences[number], frame - int(self.first_frames[number])
+        stop = start + self.length
+        pairs = np.stack([sequence.scans[start:stop], sequence.scans[start + 1 : stop + 1]], axis=1)
+        motions = sequence.motions[start:stop].copy()
+        if self.max_turn_bins:
+            turns = np.random.default_rng(seed).integers(
+                -self.max_turn_bins, self.max_turn_bins, self.length, endpoint=True
+            )
+            for pair, turn in zip(pairs, turns, strict=True):
+                pair[1] = turn_scan(pair[1], int(turn), self.sensor)
+            motions[:, 1] += turns * math.radians(self.sensor.resolution_deg)
+        if mirror:
+            pairs = pairs[..., ::-1]
+            motions[:, 1] *= -1
+        return pairs, motions
+
+
+def turn_scan(scan: np.ndarray, bins: int, sensor: Sensor) -> np.ndarray:
+    """The depth vector (bins,) as seen by a laser turned left by whole bins.
+
+    What turns out of a partial field of view is lost, and what turns into it is empty.
+    """
+    if sensor.field_of_view_deg == 360:
+        turned = np.roll(scan[:-1], -bins)
+        return np.append(turned, turned[0])
+    turned = np.roll(scan, -bins)
+    turned[len(turned) - bins if bins > 0 else 0 : None if bins > 0 else -bins] = 0
+    return turned
+
+
+class WindowSampler(Sampler[Draw]):
+    """Every epoch cuts each drive into windows from another random frame on, and shuffles them.
+
+    All draws come from (seed, epoch), so that an epoch is the same however it was reached.
+
+    Args:
+        lengths: frames of each drive. window: pairs in a window. mirror: mirror every other window.
+    """
+
+    def __init__(self, lengths: list[int], window: int, mirror: bool, seed: int) -> None:
+        self.lengths, self.window, self.mirror, self.seed = lengths, window, mirror, seed
+        # One window fewer than would fit leaves the room by which the first frame moves.
+        self.counts = [max(1, length // window - 1) if window > 1 else length - 1 for length in lengths]
+        self.epoch = 0
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before each epoch."""
+        self.epoch = epoch
+
+    def __len__(self) -> int:
+        return sum(self.counts)
+
+    def __iter__(self) -> Iterator[Draw]:
+        rng = np.random.default_rng([self.seed, self.epoch])
+        frames, first = [], 0
+        for length, count in zip(self.lengths, self.counts, strict=True):
+            room = length - 1 - count * self.window
+            offset = int(rng.integers(min(room, self.window - 1) + 1))
+            frames += [first + offset + window * self.window for window in range(count)]
+            first += length
+        for frame in rng.permutation(frames):
+            yield int(frame), int(rng.integers(2**32)), self.mirror and bool(rng.integers(2))
+
+
+class Drives(Dataset):
+    """Whole sequences in order, each one item: ``name``, ``scans`` (N, bins), ``poses`` and so on."""
+
+    def __init__(self, sequences: list[EncodedSequence]) -> None:
+        self.sequences = sequences
+
+    def __len__(self) -> int:
+        return len(self.sequences)
+
+    def __getitem__(self, number: int) -> dict[str, Any]:
+        sequence = self.sequences[number]
+        return {"number": number, "scans": torch.from_numpy(np.array(sequence.scans))}
+
+
+class OdometryDataModule(L.LightningDataModule):
+    """Recordings, encoded once, for all four variants.
+
+    Args:
+        read: name -> ``Sequence``.
+        train, val, test: names of sequences; ``NAME[0.85:]`` takes a part of one, as fractions of it.
+        sensor: what the depth vectors are like.
+        window: pairs in a training window; 1 for the CNNs. batch_size: windows in a batch.
+        max_turn_deg, mirror: label-exact augmentation of the training windows; 0 and False: none.
+        cache_dir: where encoded scans are kept. workers: processes that encode; None for all cores.
+        seed: of the order and the augmentation.
+    """
+
+    def __init__(
+        self,
+        read: Callable[[str], Sequence],
+        train: list[str],
+        val: list[str],
+        test: list[str],
+        sensor: Sensor,
+        cache_dir: str | Path,
+        window: int = 1,
+        batch_size: int = 64,
+        max_turn_deg: float = 0.0,
+        mirror: bool = False,
+        workers: int | None = None,
+        seed: int = 0,
+    ) -> None:
+        super().__init__()
+        self.read, self.sensor, self.cache_dir = read, sensor, Path(cache_dir)
+        self.names = {"train": train, "val": val, "test": test}
+        self.window, self.batch_size, self.seed = window, batch_size, seed
+        self.max_turn_bins, self.mirror = round(max_turn_deg / sensor.resolution_deg), mirror
+        self.workers = workers or os.cpu_count() or 1
+        self.sequences: dict[str, list[EncodedSequence]] = {}
+
+    def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
+        """Reads and encodes the sequences of these splits; does nothing for those that are there.
+
+        Raises:
+            InputError: a recording is missing, damaged or too short.
+        """
+        for split in (split for split in splits if split not in self.sequences):
+            if not self.names[split]:
+                raise InputError(f"data.{split} names no sequence")
+        wanted = [parse_part(name) for split in splits for name in self.names[split]]
+        files = list(dict.fromkeys(file for file, _, _ in wanted))
+        recordings = [self.read(file) for file in files]
+        for recording in recordings:
+            for note in recording.notes:
+                log.info("%s: %s", recording.name, note)
+        encoded = dict(
+            zip(files, encode_sequences(recordings, self.sensor, self.cache_dir, self.workers), strict=True)
+        )
+        for split in splits:
+            self.sequences[split] = [cut(encoded, name) for name in self.names[split]]
+        for sequence in self.sequences.get("train", []):
+            if len(sequence) <= self.window:
+                raise InputError(
+                    f"training sequence {sequence.name} has {len(sequence)} frames, a window needs "
+                    f"{self.window + 1}; leave it out of data.train or set model.window lower"
+                )
+        return self
+
+    def setup(self, stage: str | None = None) -> None:
+        """Lightning's hook: the same as :meth:`load`, once."""
+        if not self.sequences:
+            self.load()
+
+    def motion_statistics(self) -> tuple[FloatArray, FloatArray]:
+        """Mean and standard deviation (2,), (2,) of the training motions, metres and radians."""
+        motions = np.concatenate([sequence.motions for sequence in self.sequences["train"]])
+        return motions.mean(0), np.maximum(motions.std(0), 1e-6)
+
+    def train_dataloader(self) -> DataLoader:
+        """Shuffled batches of windows: see :class:`Windows`."""
+        sequences = self.sequences["train"]
+        sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
+        batch_size = min(self.batch_size, len(sampler))
+        windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)
+        # A batch is gathered in one call, so there is nothing to collate; worker processes would only
+        # copy what a memory map gives for nothing.
+        return DataLoader(
+            windows,
+            batch_sampler=BatchSampler(sampler, batch_size, drop_last=True),
+            collate_fn=_as_is,
+        )
+
+    def val_dataloader(self) -> DataLoader:
+        """Whole validation sequences, one an item."""
+        return DataLoader(Drives(self.sequences["val"]), batch_size=None)
+
+    def test_dataloader(self) -> DataLoader:
+        """Whole test sequences, one an item."""
+        return DataLoader(Drives(self.sequences["test"]), batch_size=None)
+
+
+def _as_is(batch: Batch) -> Batch:
+    return batch
+
+
+def parse_part(name: str) -> tuple[str, float, float]:
+    """``NAME`` or ``NAME[a:b]`` -> name and the fractions of the recording where the part lies.
+
+    Raises:
+        InputError: the brackets do not hold fractions with a < b.
+    """
+    match = re.fullmatch(r"(.+?)\[([\d.]*):([\d.]*)\]", name)
+    if match is None:
+        if "[" in name:
+            raise InputError(f"sequence {name!r}: a part is written NAME[0.0:0.85], fractions of the drive")
+        return name, 0.0, 1.0
+    try:
+        start, stop = float(match[2] or 0), float(match[3] or 1)
+    except ValueError:
+        start, stop = 1.0, 0.0
+    if not 0 <= start < stop <= 1:
+        raise InputError(f"sequence {name!r}: a part needs two fractions between 0 and 1, the smaller first")
+    return match[1], start, stop
+
+
+def cut(encoded: Mapping[str, EncodedSequence], name: str) -> EncodedSequence:
+    """The part of a recording that ``name`` asks for, without the ends whose truth is unknown.
+
+    Raises:
+        InputError: the truth has gaps inside, or fewer than two frames are left.
+    """
+    file, start, stop = parse_part(name)
+    whole = encoded[file]
+    part = whole.part(round(start * len(whole)), round(stop * len(whole)), name)
+    known = np.flatnonzero(np.isfinite(part.poses).all((1, 2)))
+    if len(known) < 2:
+        raise InputError(f"sequence {name} has {len(known)} frames with known poses; two are needed")
+    first, last = int(known[0]), int(known[-1])
+    if len(known) != last - first + 1:
+        gap = int(np.flatnonzero(np.diff(known) > 1)[0])
+        raise InputError(
+            f"sequence {name}: the truth is unknown at frame {known[gap] + 1}, between known ones; "
+            "use parts of it, NAME[a:b]"
+        )
+    if len(known) != len(part):
+        log.info("%s: frames %d to %d of %d, where the truth is known", name, first, last, len(part))
+    return part.part(first, last + 1)

@@ -1,0 +1,123 @@
+"""Scores of estimated motions: drift, its floor, and the errors of single frames."""
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.metrics.drift import Drift, drift
+from rcnn_odom.motion import ApplyStep, FloatArray, change_frame, compose, wrap_angle
+
+STANDING = (0.01, np.deg2rad(0.2))
+"""A frame stands still when it moves less than this, metres and radians: the noise of good odometry."""
+
+Report = dict[str, Any]
+"""Plain numbers under names, ready for JSON."""
+
+
+def camera_trajectory(sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep) -> FloatArray:
+    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files."""
+    return change_frame(compose(motions, apply), sequence.camera_from_laser)
+
+
+def planar_drift(
+    sequence: EncodedSequence, motions: FloatArray, lengths: list[float], apply: ApplyStep
+) -> Drift:
+    """Drift of motions (N-1, 2) over one sequence, as ``rcnn-odom drift --planar`` prints it."""
+    truth = change_frame(sequence.poses, sequence.camera_from_laser)
+    return drift(truth, camera_trajectory(sequence, motions, apply), planar=True, lengths=lengths)
+
+
+def score(
+    sequence: EncodedSequence, motions: FloatArray, lengths: list[float], apply: ApplyStep = "end"
+) -> Report:
+    """Everything that is reported of one sequence.
+
+    Args:
+        sequence: with its truth.
+        motions: estimated, (N-1, 2) metres and radians.
+        lengths: of the drift's segments in metres.
+        apply: where along its turn a step is taken, for the estimate and the floor.
+
+    Returns:
+        ``drift`` of the estimate and ``floor`` of the true motions composed the same way, both as the
+        command line prints them, and the errors of single frames.
+    """
+    return {
+        "frames": len(sequence),
+        "drift": planar_drift(sequence, motions, lengths, apply).to_dict(),
+        "floor": planar_drift(sequence, sequence.motions, lengths, apply).to_dict(),
+        **frame_errors(motions, sequence.motions),
+    }
+
+
+def frame_errors(motions: FloatArray, truth: FloatArray) -> Report:
+    """Errors of motions (N, 2) against the truth (N, 2): mean absolute, mean signed, largest.
+
+    Frames that move and frames that stand still, by the truth, are also told apart.
+    """
+    error = motions - truth
+    error[:, 1] = wrap_angle(error[:, 1])
+    standing = (np.abs(truth) < STANDING).all(1)
+    report = _errors(error)
+    for name, chosen in (("moving", ~standing), ("standing", standing)):
+        report[name] = {"frames": int(chosen.sum()), **(_errors(error[chosen]) if chosen.any() else {})}
+    return report
+
+
+def _errors(error: FloatArray) -> Report:
+    report = {}
+    for name, values in (("distance_{}_m", error[:, 0]), ("heading_{}_deg", np.rad2deg(error[:, 1]))):
+        report[name.format("mae")] = float(np.abs(values).mean())
+        report[name.format("bias")] = float(values.mean())
+        report[name.format("max")] = float(np.abs(values).max())
+    return report
+
+
+def score_all(
+    sequences: list[EncodedSequence],
+    motions: Mapping[str, FloatArray],
+    lengths: list[float],
+    apply: ApplyStep = "end",
+) -> Report:
+    """Scores of all sequences by name, and the means over those that have a segment.
+
+    Returns:
+        ``drift`` and ``floor`` (ratios; None without any segment) and ``sequences``.
+    """
+    scores = {s.name: score(s, motions[s.name], lengths, apply) for s in sequences}
+    report: Report = {}
+    for key in ("drift", "floor"):
+        drifts = [one[key]["t_err"] for one in scores.values() if one[key]["segments"]]
+        report[key] = float(np.mean(drifts)) if drifts else None
+    return {**report, "lengths": list(lengths), "sequences": scores}
+
+
+def table(reports: Mapping[str, Report]) -> str:
+    """Text with a row for each method and a column for each sequence, drift in percent.
+
+    Args:
+        reports: of :func:`score_all` by the name of the method, all on the same sequences.
+    """
+    first = next(iter(reports.values()))
+    names = list(first["sequences"])
+    rows = [["drift in %", *names, "mean"]]
+    floors = {name: first["sequences"][name]["floor"]["t_err"] for name in names}
+    rows.append(["floor of two-number motion", *map(percent, floors.values()), percent(first["floor"])])
+    for method, report in reports.items():
+        drifts = [report["sequences"][name]["drift"]["t_err"] for name in names]
+        rows.append([method, *map(percent, drifts), percent(report["drift"])])
+    segments = [first["sequences"][name]["drift"]["segments"] for name in names]
+    rows.append(["segments", *map(str, segments), ""])
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    lines = []
+    for label, *cells in rows:
+        padded = [cell.rjust(width) for cell, width in zip(cells, widths[1:], strict=True)]
+        lines.append("  ".join([label.ljust(widths[0]), *padded]).rstrip())
+    return "\n".join(lines)
+
+
+def percent(ratio: float | None) -> str:
+    """A ratio in percent; a dash where no segment was long enough to have one."""
+    return "-" if ratio is None else f"{100 * ratio:.2f}"

@@ -1,0 +1,31 @@
+"""Settings that make the best of the machine, each falling back by itself where it does not apply."""
+
+import ctypes
+import sys
+
+import torch
+
+MALLOC_SETTINGS = {"M_MMAP_THRESHOLD": (-3, 1 << 30), "M_TRIM_THRESHOLD": (-1, 1 << 30), "M_TOP_PAD": (-2, 1 << 26)}
+"""glibc's ``mallopt`` numbers and values in bytes (its man page)."""
+
+
+def keep_freed_memory() -> None:
+    """Lets glibc keep the large buffers of a training step instead of returning them at each one.
+
+    Every step would otherwise have the kernel clear the same hundreds of megabytes again.
+    """
+    if sys.platform.startswith("linux"):
+        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
+        for parameter, value in MALLOC_SETTINGS.values():
+            if mallopt is not None:
+                mallopt(parameter, value)
+
+
+def resolve_precision(precision: str, accelerator: str) -> str:
+    """Lightning's precision for ``auto``: bf16-mixed where the hardware multiplies bf16, else 32-true."""
+    if precision != "auto":
+        return precision
+    if accelerator != "cpu" and torch.cuda.is_available():
+        return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
+    flags = torch.cpu.get_capabilities()
+    return "bf16-mixed" if flags.get("avx512_bf16") or flags.get("amx_bf16") else "32-true"

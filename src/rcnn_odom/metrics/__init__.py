@@ -1,0 +1,1 @@
+"""Drift: a functional in numpy and a torchmetrics class that calls it."""

@@ -1,0 +1,77 @@
+"""Points of one revolution -> depth vector (paper III-A). Nothing else knows about bins."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.errors import InputError
+
+
+@dataclass(frozen=True)
+class Sensor:
+    """A 2D laser as the network sees it.
+
+    Attributes:
+        resolution_deg: width of a bin in degrees.
+        field_of_view_deg: angle covered, in degrees, symmetric about straight ahead.
+        max_range: metres; readings at or beyond it are absent returns, not walls.
+    """
+
+    resolution_deg: float = 0.1
+    field_of_view_deg: float = 360.0
+    max_range: float = 80.0
+
+    def __post_init__(self) -> None:
+        steps = self.field_of_view_deg / self.resolution_deg if self.resolution_deg > 0 else 0.0
+        if not 0 < self.field_of_view_deg <= 360 or abs(steps - round(steps)) > 1e-6 or steps < 1:
+            raise InputError(
+                f"sensor: a field of view of {self.field_of_view_deg} degrees (at most 360) has no "
+                f"whole number of bins of {self.resolution_deg} degrees; change data.sensor"
+            )
+        if not self.max_range > 0:
+            raise InputError(f"sensor: data.sensor.max_range must be positive, not {self.max_range}")
+
+    @property
+    def bins(self) -> int:
+        """Length of the depth vector: 3601 for the paper's sensor, the last bin closing the circle."""
+        return round(self.field_of_view_deg / self.resolution_deg) + 1
+
+    def as_dict(self) -> dict[str, Any]:
+        """Plain numbers, for checkpoints and cache keys."""
+        return asdict(self)
+
+
+def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.NDArray[np.float32]:
+    """Mean depth of the returns in every bin, 0 where there is none (paper III-A).
+
+    Bin i is centred on ``i * resolution - field_of_view / 2`` degrees from straight ahead,
+    counter-clockwise. On a full circle the first and the last bin are the same direction, backwards.
+
+    Args:
+        angles: (P,) radians, any turn of the circle, 0 straight ahead.
+        ranges: (P,) metres. Not finite, not positive, or at least ``sensor.max_range``: no return.
+
+    Returns:
+        (bins,) metres.
+    """
+    angles = np.asarray(angles, dtype=np.float64)
+    ranges = np.asarray(ranges, dtype=np.float64)
+    returned = (ranges > 0) & (ranges < sensor.max_range) & np.isfinite(angles)
+    # Turned so that bin 0 begins at 0: rounding never splits the bin behind the laser.
+    turned = np.rad2deg(angles[returned]) + (sensor.field_of_view_deg + sensor.resolution_deg) / 2
+    index = np.floor((turned % 360.0) / sensor.resolution_deg + 1e-9).astype(np.int64)
+    closes_circle = sensor.field_of_view_deg == 360
+    distinct = sensor.bins - 1 if closes_circle else sensor.bins
+    seen = index < distinct
+    if closes_circle:
+        index, seen = index % distinct, np.ones_like(seen)
+    index, depth = index[seen], ranges[returned][seen]
+    count = np.bincount(index, minlength=distinct)
+    total = np.bincount(index, weights=depth, minlength=distinct)
+    vector = np.zeros(sensor.bins, dtype=np.float32)
+    vector[:distinct] = total / np.maximum(count, 1)
+    if closes_circle:
+        vector[-1] = vector[0]
+    return vector

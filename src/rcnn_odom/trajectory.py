@@ -1,0 +1,131 @@
+"""Trajectory files: KITTI and TUM text formats, and the flattening of camera poses to a plane.
+
+Poses here are (N, 4, 4) from the camera's frame (x right, y down, z forward) to a fixed frame.
+"""
+
+from pathlib import Path
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import FloatArray
+
+
+def read_kitti(path: str | Path) -> FloatArray:
+    """Read a KITTI trajectory: a line for each frame, the upper 3x4 of the pose, row by row.
+
+    Args:
+        path: text file of 12 numbers a line; blank lines are allowed at the end only.
+
+    Returns:
+        Poses (N, 4, 4), N >= 1, translations in metres.
+
+    Raises:
+        InputError: the file cannot be read or is empty, or a line (which is named) does not hold
+            12 finite numbers.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    if not lines:
+        raise InputError(f"{path}: is empty: give a file with 12 numbers a line, one line a frame")
+    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    for number, line in enumerate(lines, start=1):
+        poses[number - 1, :3] = _parse_row(line, f"{path}:{number}")
+    return poses
+
+
+def _parse_row(line: str, where: str) -> FloatArray:
+    fields = line.split()
+    if len(fields) != 12:
+        raise InputError(f"{where}: found {len(fields)} fields where a KITTI pose has 12 numbers")
+    try:
+        row = np.array([float(field) for field in fields])
+    except ValueError as error:
+        raise InputError(f"{where}: not a KITTI pose of 12 numbers: {error}") from error
+    if not np.isfinite(row).all():
+        raise InputError(f"{where}: a pose must be finite, found nan or inf")
+    return row.reshape(3, 4)
+
+
+def write_kitti(path: str | Path, poses: npt.ArrayLike) -> None:
+    """Write poses (N, 4, 4) in KITTI's format, in full precision: `read_kitti` returns the same numbers.
+
+    Rounding would matter more than it seems: at a constant speed a distance may equal a segment's
+    length, and the last digit then decides where the segment ends.
+
+    Raises:
+        ValueError: ``poses`` has another shape.
+    """
+    poses = _check_shape(poses)
+    np.savetxt(path, poses[:, :3].reshape(-1, 12), fmt="%.16e")
+
+
+def write_tum(path: str | Path, stamps: npt.ArrayLike, poses: npt.ArrayLike) -> None:
+    """Write lines of ``stamp x y z qx qy qz qw``, the format of the TUM RGB-D benchmark.
+
+    Args:
+        path: text file to write.
+        stamps: times (N,) in seconds.
+        poses: (N, 4, 4), translations in metres. The frame is kept: camera poses stay camera poses.
+
+    Raises:
+        ValueError: the shapes do not fit.
+    """
+    poses = _check_shape(poses)
+    stamps = np.asarray(stamps, dtype=np.float64)
+    if stamps.shape != (len(poses),):
+        raise ValueError(f"stamps have shape {stamps.shape}, but there are {len(poses)} poses")
+    rows = np.column_stack([stamps, poses[:, :3, 3], _quaternions(poses[:, :3, :3])])
+    np.savetxt(path, rows, fmt=["%.9f"] + ["%.9e"] * 7)
+
+
+def _quaternions(rotations: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4) in the order x, y, z, w with w >= 0, of rotations (N, 3, 3).
+
+    Bar-Itzhack 2000: the eigenvector of the largest eigenvalue. Unlike the formula that divides by
+    the trace it has no weak spot at half turns, and bears rounded matrices.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotations, 0, -1)
+    rows = [
+        [xx - yy - zz, yx + xy, zx + xz, zy - yz],
+        [yx + xy, yy - xx - zz, zy + yz, xz - zx],
+        [zx + xz, zy + yz, zz - xx - yy, yx - xy],
+        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+    ]
+    quaternions: FloatArray = np.linalg.eigh(np.moveaxis(np.array(rows), -1, 0))[1][:, :, -1]
+    return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+
+
+def flatten(poses: npt.ArrayLike) -> FloatArray:
+    """Project camera poses on the x-z plane: x, z and the heading about y stay.
+
+    The heading is the direction of the forward axis (third column) in the plane; height, pitch and
+    roll are dropped.
+
+    Args:
+        poses: (N, 4, 4), camera frame.
+
+    Returns:
+        Planar poses (N, 4, 4) with y = 0 and rotations about y alone.
+
+    Raises:
+        ValueError: ``poses`` has another shape.
+    """
+    poses = _check_shape(poses)
+    heading = np.arctan2(poses[:, 0, 2], poses[:, 2, 2])
+    flat = np.tile(np.eye(4), (len(poses), 1, 1))
+    flat[:, 0, 0] = flat[:, 2, 2] = np.cos(heading)
+    flat[:, 0, 2] = np.sin(heading)
+    flat[:, 2, 0] = -flat[:, 0, 2]
+    flat[:, 0, 3], flat[:, 2, 3] = poses[:, 0, 3], poses[:, 2, 3]
+    return flat
+
+
+def _check_shape(poses: npt.ArrayLike) -> FloatArray:
+    poses = np.asarray(poses, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise ValueError(f"poses must have shape (N, 4, 4), not {poses.shape}")
+    return poses
