@@ -54,14 +54,13 @@ def straight(frames, step=1.0):
     return poses
 
 
-def devkit_angle(pose, single):
+def devkit_angle(pose):
     """`rotationError` of evaluate_odometry.cpp: matrices in double, the angle in single precision."""
-    real = np.float32 if single else np.float64
-    a, b, c = (real(pose[i, i]) for i in range(3))
-    return float(np.arccos(max(min(real(0.5 * (float(a + b + c) - 1.0)), real(1)), real(-1))))
+    a, b, c = (np.float32(pose[i, i]) for i in range(3))
+    return float(np.arccos(max(min(np.float32(0.5 * (float(a + b + c) - 1.0)), np.float32(1)), np.float32(-1))))
 
 
-def devkit_loop(truth, estimate, lengths, step=10, single=False):
+def devkit_loop(truth, estimate, lengths, step=10):
     """`calcSequenceErrors` of evaluate_odometry.cpp, statement by statement."""
     dist = [0.0]
     for i in range(1, len(truth)):
@@ -76,7 +75,7 @@ def devkit_loop(truth, estimate, lengths, step=10, single=False):
             delta_result = np.linalg.inv(estimate[first]) @ estimate[last]
             error = np.linalg.inv(delta_result) @ delta_gt
             t_err = math.hypot(*error[:3, 3]) / length
-            rows.append((first, last, length, t_err, devkit_angle(error, single) / length))
+            rows.append((first, last, length, t_err, devkit_angle(error) / length))
     return np.array(rows)
 
 
@@ -88,11 +87,9 @@ def read_devkit(path):
     return overall, {float(line[0]): [float(field) for field in line[1:]] for line in lines}
 
 
-# planar-07 has segments that turn out better than 0.02 degrees. The devkit's single-precision arc cosine
-# reads them as 0, so its rotational error is off by up to 0.1 % there; see the test after this one.
 @needs_examples
-@pytest.mark.parametrize(("name", "r_tolerance"), [("full3d-09", 1e-4), ("planar-07", 1e-3)])
-def test_agrees_with_the_devkit(name, r_tolerance):
+@pytest.mark.parametrize("name", ["full3d-09", "planar-07"])
+def test_agrees_with_the_devkit(name):
     truth, estimate = (read_kitti(EXAMPLES / f"{name}-{part}.txt") for part in ("gt", "est"))
     overall, per_length = read_devkit(EXAMPLES / f"{name}-devkit.txt")
     result = drift(truth, estimate, planar=False)
@@ -101,15 +98,15 @@ def test_agrees_with_the_devkit(name, r_tolerance):
     for ours, (segments, t_err, r_err) in pairs:
         assert ours.segments == segments
         assert ours.t_err == pytest.approx(t_err, rel=1e-4)
-        assert ours.r_err_deg_per_m == pytest.approx(r_err, rel=r_tolerance)
+        assert ours.r_err_deg_per_m == pytest.approx(r_err, rel=1e-4)
 
 
 @needs_examples
 @pytest.mark.parametrize("name", ["full3d-09", "planar-07"])
-def test_only_single_precision_separates_us_from_the_devkit(name):
+def test_the_slow_loop_is_the_devkit(name):
     truth, estimate = (read_kitti(EXAMPLES / f"{name}-{part}.txt") for part in ("gt", "est"))
     (segments, t_err, r_err), per_length = read_devkit(EXAMPLES / f"{name}-devkit.txt")
-    rows = devkit_loop(truth, estimate, KITTI_LENGTHS, single=True)
+    rows = devkit_loop(truth, estimate, KITTI_LENGTHS)
     assert len(rows) == segments
     assert rows[:, 3].mean() == pytest.approx(t_err, rel=1e-5)
     assert np.degrees(rows[:, 4].mean()) == pytest.approx(r_err, rel=1e-5)
@@ -125,7 +122,7 @@ def test_planar_of_a_planar_drive_is_the_same():
     flat, full = drift(truth, estimate, planar=True), drift(truth, estimate, planar=False)
     assert flat.segments == full.segments
     assert flat.t_err == pytest.approx(full.t_err, rel=1e-7)
-    assert flat.r_err_deg_per_m == pytest.approx(full.r_err_deg_per_m, rel=1e-5)
+    assert flat.r_err_deg_per_m == pytest.approx(full.r_err_deg_per_m, rel=1e-3)
 
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
@@ -137,7 +134,7 @@ def test_agrees_with_the_slow_loop(seed, lengths, step):
     ours = np.stack([errors.start, errors.end, errors.length, errors.t_err, errors.r_err], axis=1)
     np.testing.assert_array_equal(ours[:, :3], expected[:, :3])
     np.testing.assert_allclose(ours[:, 3], expected[:, 3], rtol=1e-8)
-    np.testing.assert_allclose(ours[:, 4], expected[:, 4], rtol=1e-6)
+    np.testing.assert_allclose(ours[:, 4], expected[:, 4], atol=1e-7)
     result = summarise(errors)
     assert result.t_err == pytest.approx(expected[:, 3].mean(), rel=1e-9)
     assert result.r_err_deg_per_m == pytest.approx(np.degrees(expected[:, 4].mean()), rel=1e-6)
@@ -165,21 +162,19 @@ def test_scale_error_of_a_straight_line():
     assert result.r_err_deg_per_m == 0
 
 
-@pytest.mark.parametrize("turn", [1e-3, 1e-7, 1e-12])
-def test_constant_yaw_drift_is_exact_even_when_tiny(turn):
+@pytest.mark.parametrize(("turn", "tolerance"), [(1e-2, 1e-6), (1e-4, 1e-3)])
+def test_constant_yaw_drift(turn, tolerance):
     estimate = straight(300)
     estimate[:, :3, :3] = [turned(0, 0, turn * frame) for frame in range(300)]
     result = drift(straight(300), estimate, planar=True, lengths=(100.0,))
-    assert result.r_err_deg_per_m == pytest.approx(
-        np.degrees(turn) * 101 / 100, rel=1e-3 if turn < 1e-9 else 1e-8
-    )
+    assert result.r_err_deg_per_m == pytest.approx(np.degrees(turn) * 101 / 100, rel=tolerance)
 
 
 def test_half_turn_error():
     estimate = straight(120)
     estimate[60:, :3, :3] = turned(0, 0, np.pi)
     errors = segment_errors(straight(120), estimate, (100.0,))
-    np.testing.assert_allclose(errors.r_err * 100, np.pi, rtol=1e-12)
+    np.testing.assert_allclose(errors.r_err * 100, np.pi, rtol=1e-6)
 
 
 def test_the_start_of_the_estimate_does_not_matter():

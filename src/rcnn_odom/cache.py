@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import logging
 import os
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
@@ -16,6 +17,8 @@ from tqdm import tqdm
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.motion import FloatArray, relative_motions
 from rcnn_odom.scan import Sensor, encode
+
+log = logging.getLogger(__name__)
 
 ENCODING_VERSION = 1
 """Raised whenever ``rcnn_odom.scan.encode`` gives other numbers for the same input."""
@@ -78,11 +81,12 @@ def encode_sequences(
     if missing:
         folder.mkdir(parents=True, exist_ok=True)
         total = sum(len(sequence) for sequence in missing.values())
+        log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
         # Fresh processes: a fork of one that has started torch's threads can hang.
         pool = ProcessPoolExecutor(
             workers, get_context("spawn"), initializer=_start_worker, initargs=(list(missing.values()), sensor)
         )
-        with pool, tqdm(total=total, desc="encoding scans", unit="scan") as bar:
+        with pool, tqdm(total=total, desc="encoding scans", unit="scan", disable=None) as bar:
             for number, (path, sequence) in enumerate(missing.items()):
                 _write_cache(path, number, (len(sequence), sensor.bins), pool, bar)
     return [

@@ -169,14 +169,14 @@ class OdometryDataModule(L.LightningDataModule):
         self.sequences: dict[str, list[EncodedSequence]] = {}
 
     def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
-        """Reads and encodes the sequences of these splits; does nothing for those that are there.
+        """Reads and encodes the sequences of these splits.
 
         Raises:
-            InputError: a recording is missing, damaged or too short.
+            InputError: a split is empty; a recording is missing, damaged or too short.
         """
-        for split in (split for split in splits if split not in self.sequences):
+        for split in splits:
             if not self.names[split]:
-                raise InputError(f"data.{split} names no sequence")
+                raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
         wanted = [parse_part(name) for split in splits for name in self.names[split]]
         files = list(dict.fromkeys(file for file, _, _ in wanted))
         recordings = [self.read(file) for file in files]

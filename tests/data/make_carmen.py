@@ -5,6 +5,7 @@ import gzip
 from pathlib import Path
 
 import numpy as np
+
 from data.make_kitti import cast, drive, world
 
 MAX_READING = 81.91

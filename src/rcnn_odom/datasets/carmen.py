@@ -69,19 +69,13 @@ def load(
     path = _find_log(Path(root), name)
     lines, other_lasers = _read_log(path, field_of_view_deg)
     beams = Beams.of(lines)
-    laser = np.array([line.laser for line in lines])
-    wheels = _wheel_odometry(lines, laser)
     stamps = np.array([line.stamp for line in lines])
-    notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range), *_check_stamps(stamps)]
     if reference is None:
-        truth = laser
-        notes += _name_truth(lines)
+        poses, about_truth = planar_to_poses([line.laser for line in lines]), _name_truth(lines)
     else:
-        table = _find_reference(Path(reference), name)
-        truth = _read_reference(table, len(lines))
-        notes += [f"truth: {table.name}", f"{int(np.isnan(truth[:, 0]).sum())} scans without truth"]
-    poses = planar_to_poses(truth)
-    poses[np.isnan(truth[:, 0])] = np.nan
+        poses, about_truth = _read_truth(_find_reference(Path(reference), name), len(lines))
+    notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
+    notes += [*_check_stamps(stamps), *about_truth]
     status = path.stat()
     key = f"carmen {READER_VERSION} {path.name} {status.st_size} {status.st_mtime_ns} {field_of_view_deg!r}"
     return Sequence(
@@ -90,7 +84,7 @@ def load(
         stamps=stamps,
         read_scan=beams,
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
-        wheel_odometry=wheels,
+        wheel_odometry=_wheel_odometry(lines),
         notes=tuple(notes),
     )
 
@@ -143,7 +137,9 @@ def _find_log(root: Path, name: str) -> Path:
         raise InputError(f"{root}: no such folder; set data.root to the folder of the log")
     found = [root / (name + suffix) for suffix in SUFFIXES if (root / (name + suffix)).is_file()]
     if not found:
-        raise InputError(f"{root / name}: no such file, nor with .log or .clf and .gz or .bz2; correct the name")
+        raise InputError(
+            f"{root / name}: no such file, nor with .log or .clf and .gz or .bz2; correct the name"
+        )
     if len(found) > 1:
         names = ", ".join(path.name for path in found)
         raise InputError(f"{root / name}: several files match ({names}); give the full name of one")
@@ -181,7 +177,9 @@ def _read_log(path: Path, field_of_view_deg: float) -> tuple[list[LaserLine], Co
             fields = text.split()
             line = _parse_flaser(fields, field_of_view_deg) if kind == "FLASER" else _parse_robotlaser(fields)
         except ValueError as error:
-            raise InputError(f"{path}:{number}: broken {kind} line ({error}); correct or remove it") from error
+            raise InputError(
+                f"{path}:{number}: broken {kind} line ({error}); correct or remove it"
+            ) from error
         if lines and lines[0].kind != kind:
             raise InputError(
                 f"{path}:{number}: {kind} after {lines[0].kind} lines, perhaps the same scans twice; "
@@ -190,7 +188,9 @@ def _read_log(path: Path, field_of_view_deg: float) -> tuple[list[LaserLine], Co
         lines.append(line)
     if not lines:
         others_found = f", only {', '.join(sorted(others))}" if others else ""
-        raise InputError(f"{path}: no FLASER or ROBOTLASER1 line in it{others_found}; convert the log to one of them")
+        raise InputError(
+            f"{path}: no FLASER or ROBOTLASER1 line in it{others_found}; convert the log to one of them"
+        )
     return lines, others
 
 
@@ -255,10 +255,10 @@ def _finite(words: list[str]) -> list[float]:
     return values
 
 
-def _wheel_odometry(lines: list[LaserLine], laser: FloatArray) -> FloatArray:
+def _wheel_odometry(lines: list[LaserLine]) -> FloatArray:
     wheels = planar_to_poses([line.robot for line in lines])
     if lines[0].kind == "ROBOTLASER1":
-        wheels = wheels @ (np.linalg.inv(wheels[0]) @ planar_to_poses(laser[:1])[0])
+        wheels = wheels @ (np.linalg.inv(wheels[0]) @ planar_to_poses([lines[0].laser])[0])
     return wheels
 
 
@@ -311,8 +311,19 @@ def _find_reference(reference: Path, name: str) -> Path:
             stem = stem.removesuffix(suffix)
         reference = reference / f"{stem}_dense_ref.csv"
     if not reference.is_file():
-        raise InputError(f"{reference}: no such file; set data.reference to a table or its folder, or leave it out")
+        raise InputError(
+            f"{reference}: no such file; set data.reference to a table or its folder, or leave it out"
+        )
     return reference
+
+
+def _read_truth(path: Path, scans: int) -> tuple[FloatArray, list[str]]:
+    """Poses (scans, 4, 4) of a reference, nan where it has none, and notes on them."""
+    planar = _read_reference(path, scans)
+    unknown = np.isnan(planar[:, 0])
+    poses = planar_to_poses(planar)
+    poses[unknown] = np.nan
+    return poses, [f"truth: {path.name}", f"{int(unknown.sum())} scans without truth"]
 
 
 def _read_reference(path: Path, scans: int) -> FloatArray:
@@ -338,5 +349,7 @@ def _read_reference(path: Path, scans: int) -> FloatArray:
             )
         truth[row] = np.nan if np.isnan(pose).any() else pose
     if len(truth) != scans:
-        raise InputError(f"{path}: {len(truth)} rows, but the log has {scans} scans; use the log's own reference")
+        raise InputError(
+            f"{path}: {len(truth)} rows, but the log has {scans} scans; use the log's own reference"
+        )
     return truth

@@ -20,8 +20,13 @@ READER_VERSION = 1
 
 POINT_BYTES = 16
 SAMPLED_FRAMES = 20
-RING_DROP = np.deg2rad(10.0)
-"""The azimuth drops by at least this much between rings, and by far less within one (noise)."""
+RING_DROP = np.deg2rad(30.0)
+"""The azimuth drops by more than this between rings; within one, close objects make it drop by up to 7."""
+
+LEVEL = np.deg2rad(0.15)
+"""Elevation that the chosen ring is to be nearest to: a hair above horizontal. KITTI's two most level rings
+lie at +0.06 to +0.25 and at -0.1 to -0.3 degrees, so that the one nearest to 0 would change between
+sequences; the upper one is also the one that a pitching car turns into the road last."""
 
 Points = npt.NDArray[np.float32]
 
@@ -38,7 +43,7 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
         name: folder under ``sequences``, for instance ``"05"``.
         root: folder that holds ``sequences`` and ``poses``.
         ring: which of the lasers, 0 the first in the file. None: the one whose median elevation is
-            nearest to horizontal, one for the whole sequence.
+            nearest to horizontal (see ``LEVEL``), one for the whole sequence.
 
     Raises:
         InputError: a file is missing, cut off or not as the format says.
@@ -134,9 +139,9 @@ def read_calibration(path: str | Path) -> FloatArray:
             tr = np.eye(4)
             tr[:3] = np.reshape(_numbers(path, number, line[3:], 12), (3, 4))
             if abs(np.linalg.det(tr[:3, :3]) - 1) > 0.01:
-                raise InputError(f"{path}:{number}: Tr is not a rotation and a shift; restore the original file")
+                raise InputError(f"{path}:{number}: Tr holds no rotation; restore the original file")
             return tr
-    raise InputError(f"{path}: no line starts with 'Tr:' (camera from laser); use the odometry data's calib.txt")
+    raise InputError(f"{path}: no line starts with 'Tr:' (laser to camera); use the odometry data's own")
 
 
 def read_poses(path: str | Path) -> FloatArray:
@@ -169,12 +174,17 @@ def _most_level_ring(scans: list[Path]) -> tuple[int, float]:
     for frame in frames:
         points = _read_points(scans[frame])
         rings = _split_rings(points, ring_starts(points))
-        elevations.append([float(np.median(np.arctan2(z, np.hypot(x, y)))) for x, y, z in (r.T for r in rings)])
+        elevations.append([_median_elevation(ring) for ring in rings])
     shared = min(map(len, elevations))
     # In single frames a neighbour can be nearer: the median over frames settles on one.
     median = np.median([of_frame[:shared] for of_frame in elevations], axis=0)
-    ring = int(np.argmin(np.abs(median)))
+    ring = int(np.argmin(np.abs(median - LEVEL)))
     return ring, float(np.rad2deg(median[ring]))
+
+
+def _median_elevation(points: Points) -> float:
+    x, y, z = points.T
+    return float(np.median(np.arctan2(z, np.hypot(x, y))))
 
 
 def _read_points(path: str | Path) -> Points:
@@ -247,6 +257,8 @@ def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
     except ValueError:
         values = []
     if len(values) != count or not np.isfinite(values).all():
-        plural = "finite number" if count == 1 else "finite numbers"
-        raise InputError(f"{path}:{number}: expected {count} {plural}, got '{text.strip()[:40]}'; correct the line")
+        raise InputError(
+            f"{path}:{number}: expected {count} finite number{'s' * (count > 1)}, found {len(text.split())} "
+            f"words, '{text.strip()[:40]}'; correct the line"
+        )
     return values
