@@ -2,13 +2,10 @@
 
 import logging
 import sys
-from pathlib import Path
 
 import hydra
 from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
-
-sys.path.insert(0, str(Path(__file__).parent / "src"))
 
 from rcnn_odom.errors import InputError
 
@@ -23,17 +20,19 @@ def train(cfg: DictConfig) -> dict:
         InputError: see its message.
     """
     # Here and not above: `--help` and a mistyped option should not wait for torch.
-    from rcnn_odom import experiment
+    from pathlib import Path
+
+    from rcnn_odom import experiment, runs
 
     settings = experiment.plain(cfg)
-    run = experiment.start_run(settings)
+    run = Path(settings["run_dir"])
     trainer = experiment.build_trainer(settings, run)
+    runs.start_run(run, settings)
+    runs.point_latest(Path(settings["outputs"]), run)
     datamodule = experiment.build_datamodule(settings).load()
-    module = experiment.build_module(settings, datamodule)
-    if module.recurrent:
-        module.load_first_stage(experiment.first_stage(settings, datamodule))
-    module = experiment.fit(trainer, module, datamodule, run)
-    return experiment.finish_run(settings, trainer, module, datamodule, run)
+    metrics = experiment.train_module(settings, datamodule, trainer)
+    log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
+    return metrics
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")

@@ -1,0 +1,22 @@
+# The commands of the README. Each installs what it needs on its first run.
+PYTHON ?= python3
+BIN := .venv/bin
+
+.PHONY: train test lint install
+install: .venv/installed
+
+.venv/installed: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --constraint constraints.txt --editable .[dev]
+	touch $@
+
+train: install
+	$(BIN)/python train.py model=rcnn_reg
+
+test: install
+	$(BIN)/pytest
+
+lint: install
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy

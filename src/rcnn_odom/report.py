@@ -1,0 +1,112 @@
+"""What a run leaves behind: scores beside the baselines, trajectories, figures, the HParams row."""
+
+import logging
+import re
+from importlib.metadata import version
+from pathlib import Path
+
+import lightning as L
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from rcnn_odom.baselines.constant import ConstantMotion, held_motion
+from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
+from rcnn_odom.figures import motion_figure, trajectory_figure
+from rcnn_odom.modules import OdometryModule
+from rcnn_odom.motion import FloatArray, compose, relative_motions
+from rcnn_odom.runs import Settings
+from rcnn_odom.trajectory import write_kitti, write_tum
+
+log = logging.getLogger(__name__)
+
+PACKAGES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "rcnn-odom")
+Motions = dict[str, FloatArray]
+"""Estimated motions (N-1, 2) by the name of the sequence."""
+
+
+def report_test(
+    module: OdometryModule,
+    motions: Motions,
+    sequences: list[EncodedSequence],
+    data: Settings,
+    folder: Path,
+    logger: TensorBoardLogger | None = None,
+) -> Report:
+    """Scores a network's estimates beside the baselines; writes trajectories and figures.
+
+    Args:
+        module: the network that estimated, which also knows the mean of its training motions.
+        motions: its estimates.
+        sequences: what was estimated.
+        data: the options of ``conf/data``.
+        folder: gets ``trajectories`` and ``figures``.
+        logger: also gets the figures.
+
+    Returns:
+        ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name, and
+        the ``versions`` of what computed them.
+    """
+    estimates = {module.variant: motions, **baseline_motions(module, sequences)}
+    reports = {
+        method: score_all(sequences, estimated, data["lengths"], data["apply"])
+        for method, estimated in estimates.items()
+    }
+    log.info("\n%s\n", table(reports))
+    test = reports.pop(module.variant)
+    for sequence in sequences:
+        drift = percent(test["sequences"][sequence.name]["drift"]["t_err"])
+        title = f"{module.variant} on {data['name']} {sequence.name}: drift {drift} %"
+        write_sequence(sequence, motions[sequence.name], title, data, folder, logger)
+    versions = {package: version(package) for package in PACKAGES}
+    return {"test": test, "baselines": reports, "versions": versions}
+
+
+def baseline_motions(module: OdometryModule, sequences: list[EncodedSequence]) -> dict[str, Motions]:
+    """What the baselines estimate, by their name; wheel odometry where every log has it."""
+    mean = ConstantMotion(module.network.head.mean.double().cpu().numpy())
+    baselines = {
+        name: {sequence.name: baseline.estimate(sequence.scans) for sequence in sequences}
+        for name, baseline in (("mean_motion", mean), ("held_motion", held_motion()))
+    }
+    wheels = {s.name: relative_motions(s.wheel_odometry) for s in sequences if s.wheel_odometry is not None}
+    return baselines | ({"wheel_odometry": wheels} if len(wheels) == len(sequences) else {})
+
+
+def write_sequence(
+    sequence: EncodedSequence,
+    motions: FloatArray,
+    title: str,
+    data: Settings,
+    folder: Path,
+    logger: TensorBoardLogger | None,
+) -> None:
+    """One sequence's trajectory in KITTI and TUM format and the paper's two figures of it."""
+    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("_")
+    for kind in ("trajectories", "figures"):
+        (folder / kind).mkdir(parents=True, exist_ok=True)
+    poses = camera_trajectory(sequence, motions, data["apply"])
+    write_kitti(folder / "trajectories" / f"{name}.txt", poses)
+    write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, poses)
+    figures = {
+        "trajectory": trajectory_figure(title, sequence.poses, compose(motions, data["apply"])),
+        "motion": motion_figure(title, sequence.motions, motions),
+    }
+    for kind, figure in figures.items():
+        figure.savefig(folder / "figures" / f"{name}_{kind}.png", dpi=120)
+        if logger is not None:
+            logger.experiment.add_figure(f"test/{name}_{kind}", figure)
+
+
+def log_hyperparameters(trainer: L.Trainer, settings: Settings, metrics: Report) -> None:
+    """The row of TensorBoard's HParams tab: every setting, and drift as its metric."""
+    scores = {"val/drift": metrics["val"]["drift"], "test/drift": metrics["test"]["drift"]}
+    parameters = {name: str(value) if isinstance(value, list) else value for name, value in _flat(settings)}
+    assert trainer.logger is not None
+    trainer.logger.log_hyperparams(parameters, {name: value for name, value in scores.items() if value is not None})
+
+
+def _flat(settings: Settings, prefix: str = "") -> list[tuple[str, object]]:
+    pairs: list[tuple[str, object]] = []
+    for key, value in settings.items():
+        pairs += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
+    return pairs

@@ -1,0 +1,91 @@
+"""Run folders: what is in them, and how one is found again."""
+
+import hashlib
+import json
+import logging
+import os
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from rcnn_odom.datamodule import OdometryDataModule
+from rcnn_odom.errors import InputError
+
+log = logging.getLogger(__name__)
+
+Settings = dict[str, Any]
+"""A resolved configuration: plain numbers, strings, lists and dictionaries."""
+
+CONFIG, METRICS = "config.yaml", "metrics.json"
+BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
+
+
+def start_run(run: Path, settings: Settings) -> None:
+    """Makes a run's folder with its resolved configuration, or enters one that was stopped.
+
+    Raises:
+        InputError: the folder holds a finished run or one with other settings, or cannot be written.
+    """
+    config = run / CONFIG
+    if (run / METRICS).exists():
+        raise InputError(f"{run}: holds a finished run; choose another run_dir")
+    if config.exists() and yaml.safe_load(config.read_text()) != settings:
+        raise InputError(f"{config}: the run was begun with other settings; repeat them, or choose another run_dir")
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+        config.write_text(yaml.safe_dump(settings, sort_keys=False))
+    except OSError as error:
+        raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
+    log.info("run %s, seed %d", run, settings["seed"])
+
+
+def point_latest(outputs: Path, run: Path) -> None:
+    """Lets ``latest`` among the runs point to this one."""
+    link = outputs / f".latest.{os.getpid()}"
+    link.symlink_to(os.path.relpath(run, outputs))
+    link.replace(outputs / "latest")
+
+
+def read_settings(run: Path) -> Settings:
+    """The configuration that a run was started with.
+
+    Raises:
+        InputError: there is no run.
+    """
+    try:
+        return yaml.safe_load((run / CONFIG).read_text())
+    except OSError as error:
+        raise InputError(f"{run / CONFIG}: {error.strerror}; name the folder of a run, run=outputs/...") from error
+
+
+def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
+    """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
+    recordings = [
+        (sequence.key, sequence.name, hashlib.sha256(sequence.poses.tobytes()).hexdigest())
+        for split in ("train", "val")
+        for sequence in datamodule.sequences[split]
+    ]
+    data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
+    parts = [recordings, data, settings["model"], settings["trainer"], settings["seed"]]
+    return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def find_run(outputs: Path, wanted: str) -> Path | None:
+    """The best checkpoint of a finished run with this fingerprint, the newest if there are several."""
+    found = []
+    for metrics in outputs.rglob(METRICS):
+        try:
+            if json.loads(metrics.read_text())["fingerprint"] == wanted and (metrics.parent / BEST).exists():
+                found.append(metrics)
+        except (ValueError, KeyError, OSError):
+            continue  # not a finished run of ours
+    newest = max(found, key=lambda path: path.stat().st_mtime, default=None)
+    return newest.parent / BEST if newest else None
+
+
+def write_json(path: Path, content: dict[str, Any]) -> None:
+    """Writes a file at once or not at all."""
+    partial = path.with_name(f".{path.name}.partial")
+    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.replace(path)
