@@ -1,8 +1,6 @@
 """Trained networks from disk, never trusting the file with more than numbers."""
 
-import pickle
 from pathlib import Path
-from zipfile import BadZipFile
 
 import torch
 
@@ -26,9 +24,11 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
         saved = torch.load(path, map_location="cpu", weights_only=True)
         settings, weights = saved["hyper_parameters"], saved["state_dict"]
         found = settings["variant"]
+        module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
+        module.load_state_dict(weights)
     except FileNotFoundError:
         raise InputError(f"{path}: no such checkpoint") from None
-    except (pickle.UnpicklingError, RuntimeError, EOFError, BadZipFile, OSError, KeyError, TypeError) as error:
+    except Exception as error:  # whatever the bytes of a stranger's file lead to
         reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
         raise InputError(f"{path}: not a checkpoint of this project ({reason})") from error
     if variant is not None and found != variant:
@@ -38,6 +38,4 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
             f"{path}: trained for {Sensor(**settings['sensor'])}, but the data has {sensor}; "
             "set data.sensor as in training, or train on this data"
         )
-    module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
-    module.load_state_dict(weights)
     return module.eval()

@@ -79,6 +79,7 @@ def turn_scan(scan: np.ndarray, bins: int, sensor: Sensor) -> np.ndarray:
     if sensor.field_of_view_deg == 360:
         turned = np.roll(scan[:-1], -bins)
         return np.append(turned, turned[0])
+    bins = max(-len(scan), min(bins, len(scan)))
     turned = np.roll(scan, -bins)
     turned[len(turned) - bins if bins > 0 else 0 : None if bins > 0 else -bins] = 0
     return turned
@@ -111,7 +112,7 @@ class WindowSampler(Sampler[Draw]):
         frames, first = [], 0
         for length, count in zip(self.lengths, self.counts, strict=True):
             room = length - 1 - count * self.window
-            offset = int(rng.integers(min(room, self.window - 1) + 1))
+            offset = int(rng.integers(room + 1))
             frames += [first + offset + window * self.window for window in range(count)]
             first += length
         for frame in rng.permutation(frames):
@@ -119,7 +120,7 @@ class WindowSampler(Sampler[Draw]):
 
 
 class Drives(Dataset):
-    """Whole sequences in order, each one item: ``name``, ``scans`` (N, bins), ``poses`` and so on."""
+    """Whole sequences in order, each one item: its ``number`` and ``scans`` (N, bins) in metres."""
 
     def __init__(self, sequences: list[EncodedSequence]) -> None:
         self.sequences = sequences
@@ -269,7 +270,8 @@ def cut(encoded: Mapping[str, EncodedSequence], name: str) -> EncodedSequence:
     if len(known) != last - first + 1:
         gap = int(np.flatnonzero(np.diff(known) > 1)[0])
         raise InputError(
-            f"sequence {name}: the truth is unknown at frame {known[gap] + 1}, between known ones; "
+            f"sequence {file}: the truth is unknown at frame {round(start * len(whole)) + known[gap] + 1}, "
+            "between known ones; "
             "use parts of it, NAME[a:b]"
         )
     if len(known) != len(part):

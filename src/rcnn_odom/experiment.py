@@ -3,6 +3,7 @@
 import logging
 import sys
 import time
+import warnings
 from pathlib import Path
 
 import lightning as L
@@ -22,13 +23,14 @@ from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule
 from rcnn_odom.motion import change_frame
 from rcnn_odom.report import log_hyperparameters, report_test
-from rcnn_odom.runs import BEST, LAST, METRICS, Settings, find_run, fingerprint, start_run, write_json
+from rcnn_odom.runs import BEST, LAST, METRICS, Settings, find_run, fingerprint, flat, start_run, write_json
 from rcnn_odom.scan import Sensor
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
 # Lightning tells of the machine and of its makers' products; what a user needs is said by this project.
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
+warnings.filterwarnings("ignore", module=r"lightning\.pytorch")
 
 
 CHOICES = {
@@ -45,8 +47,10 @@ def plain(cfg: DictConfig) -> Settings:
     Raises:
         InputError: a value that the user must give is missing, or one has no meaning.
     """
-    for key in sorted(OmegaConf.missing_keys(cfg)):
-        raise InputError(f"{key} is missing; give it on the command line, {key}=...")
+    written = OmegaConf.to_container(cfg)
+    for key, value in flat(written).items():  # type: ignore[arg-type]
+        if value == "???":
+            raise InputError(f"{key} is missing; give it on the command line, {key}=...")
     try:
         settings = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:

@@ -10,9 +10,10 @@ from torch import Tensor
 from torchmetrics import MeanMetric
 
 from rcnn_odom.datamodule import Batch
+from rcnn_odom.evaluation import camera_trajectory, frame_errors
 from rcnn_odom.losses import Loss, classification_loss, regression_loss
 from rcnn_odom.metrics.module import DriftMetric
-from rcnn_odom.motion import FloatArray, change_frame, compose
+from rcnn_odom.motion import FloatArray, change_frame
 from rcnn_odom.networks import CNN, RCNN, RotationClasses
 from rcnn_odom.scan import Sensor
 
@@ -123,13 +124,12 @@ class OdometryModule(L.LightningModule):
         """Scores one whole sequence."""
         sequence = self.trainer.datamodule.sequences["val"][batch["number"]]
         motions = self.estimate(batch["scans"])
-        laser = compose(motions, self.scoring["apply"])
-        to_camera = sequence.camera_from_laser
-        self.drift.update(change_frame(sequence.poses, to_camera), change_frame(laser, to_camera), sequence.name)
-        error = np.abs(motions - sequence.motions).mean(0)
+        truth = change_frame(sequence.poses, sequence.camera_from_laser)
+        self.drift.update(truth, camera_trajectory(sequence, motions, self.scoring["apply"]), sequence.name)
+        errors = frame_errors(motions, sequence.motions)
         frames = len(motions)
-        self.log("val/distance_mae_m", error[0], batch_size=frames)
-        self.log("val/heading_mae_deg", np.rad2deg(error[1]), batch_size=frames)
+        self.log("val/distance_mae_m", errors["distance_mae_m"], batch_size=frames)
+        self.log("val/heading_mae_deg", errors["heading_mae_deg"], batch_size=frames)
 
     def on_validation_epoch_end(self) -> None:
         """Logs the drift of each validation sequence and their mean."""
@@ -150,7 +150,7 @@ class OdometryModule(L.LightningModule):
         optimizer = torch.optim.Adam(
             [p for p in self.parameters() if p.requires_grad], lr=model["learning_rate"], fused=True
         )
-        steps = len(self.trainer.datamodule.train_dataloader()) * model["epochs"]
+        steps = int(self.trainer.estimated_stepping_batches)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, model["learning_rate"], total_steps=steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 

@@ -61,6 +61,8 @@ class Encoder(nn.Module):
 
     def __init__(self, bins: int, kernel_size: int = 3, pooling: Literal["avg", "max"] = "avg") -> None:
         super().__init__()
+        if kernel_size % 2 == 0:
+            raise ValueError(f"kernel_size must be odd, not {kernel_size}: padding could not keep the length")
         layers: list[nn.Module] = []
         length, inputs = bins, 2
         for number, (channels, stride) in enumerate(zip(CHANNELS, STRIDES, strict=True)):
@@ -82,7 +84,11 @@ class Encoder(nn.Module):
         """Features (B, features) of pairs (B, 2, bins), earlier scan first, ranges within 0..1."""
         # Stored with the two scans innermost, this is the channels-last layout already.
         image = pairs.transpose(1, 2).contiguous().transpose(1, 2).unsqueeze(2)
-        return self.layers(image).flatten(1)
+        # The motion shows in small differences between two scans: bf16 would round them away before the
+        # first layer can take them.
+        with torch.autocast(pairs.device.type, enabled=False):
+            image = self.layers[0](image)
+        return self.layers[1:](image).flatten(1)
 
 
 class MotionHead(nn.Module):
@@ -104,7 +110,7 @@ class MotionHead(nn.Module):
         super().__init__()
         self.distance = nn.Linear(features, 1)
         self.rotation = nn.Linear(features, classes.count if classes else 1)
-        self.argmax = angle == "argmax"
+        self.argmax = {"argmax": True, "expectation": False}[angle]
         centres = classes.centres().float() if classes else None
         self.register_buffer("centres", centres, persistent=False)
         self.register_buffer("mean", torch.zeros(2))

@@ -14,7 +14,7 @@ from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, 
 from rcnn_odom.figures import motion_figure, trajectory_figure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
-from rcnn_odom.runs import Settings
+from rcnn_odom.runs import Settings, flat
 from rcnn_odom.trajectory import write_kitti, write_tum
 
 log = logging.getLogger(__name__)
@@ -100,13 +100,6 @@ def write_sequence(
 def log_hyperparameters(trainer: L.Trainer, settings: Settings, metrics: Report) -> None:
     """The row of TensorBoard's HParams tab: every setting, and drift as its metric."""
     scores = {"val/drift": metrics["val"]["drift"], "test/drift": metrics["test"]["drift"]}
-    parameters = {name: str(value) if isinstance(value, list) else value for name, value in _flat(settings)}
+    parameters = {name: str(value) if isinstance(value, list) else value for name, value in flat(settings).items()}
     assert trainer.logger is not None
     trainer.logger.log_hyperparams(parameters, {name: value for name, value in scores.items() if value is not None})
-
-
-def _flat(settings: Settings, prefix: str = "") -> list[tuple[str, object]]:
-    pairs: list[tuple[str, object]] = []
-    for key, value in settings.items():
-        pairs += _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else [(prefix + key, value)]
-    return pairs

@@ -59,6 +59,14 @@ def read_settings(run: Path) -> Settings:
         raise InputError(f"{run / CONFIG}: {error.strerror}; name the folder of a run, run=outputs/...") from error
 
 
+def flat(settings: Settings, prefix: str = "") -> Settings:
+    """The settings under names as on the command line, ``model.kernel_size`` and so on."""
+    pairs: Settings = {}
+    for key, value in settings.items():
+        pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return pairs
+
+
 def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
     """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
     recordings = [

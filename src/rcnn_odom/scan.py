@@ -30,8 +30,8 @@ class Sensor:
                 f"sensor: a field of view of {self.field_of_view_deg} degrees (at most 360) has no "
                 f"whole number of bins of {self.resolution_deg} degrees; change data.sensor"
             )
-        if not self.max_range > 0:
-            raise InputError(f"sensor: data.sensor.max_range must be positive, not {self.max_range}")
+        if not 0 < self.max_range < float("inf"):
+            raise InputError(f"sensor: data.sensor.max_range must be positive and finite, not {self.max_range}")
 
     @property
     def bins(self) -> int:

@@ -1,0 +1,39 @@
+"""Shared pieces of the tests that run whole experiments."""
+
+import sys
+from pathlib import Path
+
+import pytest
+from hydra import compose, initialize_config_dir
+
+ROOT = Path(__file__).parents[1]
+sys.path.insert(0, str(ROOT))
+
+SMALL = [
+    "data.sensor.resolution_deg=1.0",
+    "data.workers=1",
+    "model.epochs=2",
+    "model.batch_size=8",
+    "trainer.accelerator=cpu",
+]
+SMALL_RECURRENT = [
+    "model.hidden_size=16",
+    "model.window=8",
+    "model.first_stage.epochs=1",
+    "model.first_stage.batch_size=8",
+]
+
+
+@pytest.fixture
+def configure(tmp_path):
+    """A configuration as ``train.py`` gets it, of a size for tests, writing below ``tmp_path``."""
+
+    def configure(*overrides, name="config", run="run"):
+        small = [] if name == "evaluate" else SMALL
+        if any(f"model={variant}" in overrides for variant in ("rcnn_reg", "rcnn_cls")):
+            small = small + SMALL_RECURRENT
+        folders = [f"outputs={tmp_path}/outputs", f"run_dir={tmp_path}/outputs/{run}"]
+        with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+            return compose(name, [*small, *folders, *overrides])
+
+    return configure

@@ -1,0 +1,168 @@
+"""Encoded scans: equal to direct encoding, read back without the reader, complete or absent."""
+
+import os
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from rcnn_odom.cache import EncodedSequence, cache_path, encode_sequences
+from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
+from rcnn_odom.scan import Sensor, encode
+
+SENSOR = Sensor(1.0, 180.0, 40.0)
+FRAMES = 150
+"""More than two of the blocks in which workers encode."""
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Random scans; leaves a file for each frame that was read, and fails at one of them."""
+
+    seed: int
+    calls: Path
+    broken: int = -1
+
+    def __call__(self, frame):
+        (self.calls / f"{self.seed}-{frame}").touch()
+        if frame == self.broken:
+            raise InputError(f"frame {frame}: damaged; copy it again")
+        return scan(self.seed, frame)
+
+
+def scan(seed, frame):
+    rng = np.random.default_rng([seed, frame])
+    return rng.uniform(-np.pi, np.pi, 300), rng.uniform(0, 50, 300)
+
+
+@pytest.fixture
+def calls(tmp_path):
+    folder = tmp_path / "calls"
+    folder.mkdir()
+    return folder
+
+
+def make_sequence(calls, seed=0, frames=FRAMES, **options):
+    planar = np.stack([np.arange(frames) * 0.5, np.zeros(frames), np.zeros(frames)], axis=1)
+    return Sequence(
+        name=f"drive{seed}",
+        poses=planar_to_poses(planar),
+        stamps=np.arange(frames, dtype=np.float64),
+        read_scan=Reader(seed, calls, **options),
+        fingerprint=f"print{seed}",
+        wheel_odometry=planar_to_poses(planar * 1.1),
+    )
+
+
+def direct(seed, frames=FRAMES, sensor=SENSOR):
+    return np.stack([encode(*scan(seed, frame), sensor) for frame in range(frames)])
+
+
+def files(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+def test_two_workers_give_what_direct_encoding_gives(tmp_path, calls):
+    sequences = [make_sequence(calls, 0), make_sequence(calls, 1, frames=3)]
+    first, second = encode_sequences(sequences, SENSOR, tmp_path / "deep" / "cache", workers=2)
+    np.testing.assert_array_equal(first.scans, direct(0))
+    np.testing.assert_array_equal(second.scans, direct(1, 3))
+    assert (first.name, second.name) == ("drive0", "drive1")
+    assert len(first) == FRAMES
+    for name in ("poses", "stamps", "camera_from_laser", "wheel_odometry"):
+        np.testing.assert_array_equal(getattr(first, name), getattr(sequences[0], name))
+    assert len(files(calls)) == FRAMES + 3
+    assert len(files(tmp_path / "deep" / "cache")) == 2
+
+
+def test_second_call_reads_the_file_and_no_scan(tmp_path, calls):
+    cache = tmp_path / "cache"
+    [before] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    for path in calls.iterdir():
+        path.unlink()
+    [after] = encode_sequences([make_sequence(calls, broken=5)], SENSOR, cache, workers=1)
+    assert files(calls) == []
+    assert after.key == before.key
+    np.testing.assert_array_equal(after.scans, direct(0))
+    # A map of the file, which nobody can write to.
+    assert isinstance(after.scans, np.memmap)
+    assert not after.scans.flags.writeable
+
+
+def test_only_what_is_missing_is_encoded(tmp_path, calls):
+    cache = tmp_path / "cache"
+    encode_sequences([make_sequence(calls, 0, frames=4)], SENSOR, cache, workers=1)
+    sequences = [make_sequence(calls, 1, frames=3), make_sequence(calls, 0, frames=4, broken=2)]
+    first, second = encode_sequences(sequences, SENSOR, cache, workers=1)
+    np.testing.assert_array_equal(first.scans, direct(1, 3))
+    np.testing.assert_array_equal(second.scans, direct(0, 4))
+
+
+def test_key_changes_with_all_that_changes_the_scans(tmp_path, calls):
+    sequence = make_sequence(calls)
+    others = [
+        (sequence, Sensor(0.5, 180.0, 40.0)),
+        (sequence, Sensor(1.0, 90.0, 40.0)),
+        (sequence, Sensor(1.0, 180.0, 30.0)),
+        (replace(sequence, fingerprint="another"), SENSOR),
+        (replace(sequence, name="another"), SENSOR),
+        (make_sequence(calls, frames=FRAMES - 1), SENSOR),
+    ]
+    paths = {cache_path(sequence, SENSOR, tmp_path)}
+    paths |= {cache_path(other, sensor, tmp_path) for other, sensor in others}
+    assert len(paths) == 1 + len(others)
+
+
+def test_key_does_not_change_with_the_truth(tmp_path, calls):
+    sequence = make_sequence(calls)
+    other = replace(sequence, poses=sequence.poses + 1, read_scan=Reader(9, calls), notes=("note",))
+    assert cache_path(sequence, SENSOR, tmp_path) == cache_path(other, SENSOR, tmp_path)
+
+
+def test_stopped_encoding_leaves_nothing(tmp_path, calls):
+    cache = tmp_path / "cache"
+    with pytest.raises(InputError, match="frame 140: damaged"):
+        encode_sequences([make_sequence(calls, broken=140)], SENSOR, cache, workers=2)
+    assert (calls / "0-0").exists()
+    assert files(cache) == []
+    [encoded] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    np.testing.assert_array_equal(encoded.scans, direct(0))
+
+
+def test_partial_file_of_a_killed_process_is_not_believed(tmp_path, calls):
+    cache = tmp_path / "cache"
+    cache.mkdir()
+    sequence = make_sequence(calls, frames=5)
+    path = cache_path(sequence, SENSOR, cache)
+    left = cache / f".{path.stem}.{os.getpid() + 1}.partial"
+    left.write_bytes(b"\x93NUMPY truncated")
+    [encoded] = encode_sequences([sequence], SENSOR, cache, workers=1)
+    np.testing.assert_array_equal(encoded.scans, direct(0, 5))
+    assert path.name in files(cache)
+
+
+def test_part_is_a_view_of_the_same_frames():
+    frames = 10
+    planar = np.stack([np.arange(frames) ** 2 / 10, np.zeros(frames), np.zeros(frames)], axis=1)
+    scans = np.arange(frames * 3, dtype=np.float32).reshape(frames, 3)
+    whole = EncodedSequence(
+        "drive",
+        "key",
+        scans,
+        planar_to_poses(planar),
+        np.arange(10.0),
+        FORWARD_CAMERA,
+        planar_to_poses(planar),
+    )
+    np.testing.assert_allclose(whole.motions[:, 0], np.diff(np.arange(frames) ** 2) / 10)
+    part = whole.part(2, 6, "drive[0.2:0.6]")
+    assert (part.name, len(part)) == ("drive[0.2:0.6]", 4)
+    assert np.shares_memory(part.scans, whole.scans)
+    np.testing.assert_array_equal(part.scans, scans[2:6])
+    np.testing.assert_array_equal(part.stamps, [2, 3, 4, 5])
+    np.testing.assert_array_equal(part.wheel_odometry, whole.wheel_odometry[2:6])
+    np.testing.assert_allclose(part.motions[:, 0], [0.5, 0.7, 0.9])
+    assert whole.part(0, 3).name == "drive"

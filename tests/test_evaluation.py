@@ -1,0 +1,166 @@
+"""Scores of drives by hand."""
+
+import json
+
+import numpy as np
+import pytest
+
+from rcnn_odom.baselines.constant import held_motion, mean_motion
+from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.evaluation import (
+    camera_trajectory,
+    frame_errors,
+    percent,
+    planar_drift,
+    score,
+    score_all,
+    table,
+)
+from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
+
+
+def drive(planar, name="drive", camera_from_laser=FORWARD_CAMERA):
+    planar = np.asarray(planar, dtype=np.float64)
+    scans, stamps = np.zeros((len(planar), 3), np.float32), np.arange(len(planar), dtype=np.float64)
+    return EncodedSequence(name, "key", scans, planar_to_poses(planar), stamps, camera_from_laser)
+
+
+def straight(frames=31, name="straight"):
+    return drive([(frame, 0, 0) for frame in range(frames)], name)
+
+
+def ahead(frames, distance):
+    return np.tile([distance, 0.0], (frames - 1, 1))
+
+
+def test_errors_are_signed_where_they_say_so():
+    truth = np.array([[1.0, 0.1], [1.0, 0.0], [2.0, -0.1], [2.0, 0.0]])
+    error = np.array([[0.1, 0.02], [-0.3, 0.0], [0.0, -0.05], [0.0, 0.0]])
+    errors = frame_errors(truth + error, truth)
+    assert errors["distance_mae_m"] == pytest.approx(0.1)
+    assert errors["distance_bias_m"] == pytest.approx(-0.05)
+    assert errors["distance_max_m"] == pytest.approx(0.3)
+    assert errors["heading_mae_deg"] == pytest.approx(np.degrees(0.0175))
+    assert errors["heading_bias_deg"] == pytest.approx(np.degrees(-0.0075))
+    assert errors["heading_max_deg"] == pytest.approx(np.degrees(0.05))
+
+
+def test_too_short_an_estimate_has_a_negative_bias():
+    errors = frame_errors(np.array([[0.9, 0.0]]), np.array([[1.0, 0.0]]))
+    assert errors["distance_bias_m"] == pytest.approx(-0.1)
+
+
+def test_heading_error_goes_the_short_way_round():
+    errors = frame_errors(np.array([[0.0, np.pi - 0.01]]), np.array([[0.0, -np.pi + 0.01]]))
+    assert errors["heading_bias_deg"] == pytest.approx(-np.degrees(0.02))
+    assert errors["heading_max_deg"] == pytest.approx(np.degrees(0.02))
+
+
+def test_moving_and_standing_are_told_apart_by_the_truth():
+    truth = np.array([[0.0, 0.0], [0.005, -0.003], [0.02, 0.0], [-0.02, 0.0], [0.0, 0.01], [1.0, 0.2]])
+    error = np.array([[0.2, 0.0], [0.4, 0.0], [0.0, 0.0], [0.0, 0.0], [0.0, 0.0], [0.8, 0.0]])
+    errors = frame_errors(truth + error, truth)
+    assert errors["standing"]["frames"] == 2
+    assert errors["moving"]["frames"] == 4
+    assert errors["standing"]["distance_mae_m"] == pytest.approx(0.3)
+    assert errors["moving"]["distance_mae_m"] == pytest.approx(0.2)
+
+
+def test_no_frame_has_no_error():
+    errors = frame_errors(np.array([[1.1, 0.0]]), np.array([[1.0, 0.0]]))
+    assert errors["standing"] == {"frames": 0}
+
+
+def test_arguments_are_left_alone():
+    motions, truth = np.array([[1.1, 3.0]]), np.array([[1.0, -3.0]])
+    frame_errors(motions, truth)
+    assert motions.tolist() == [[1.1, 3.0]]
+    assert truth.tolist() == [[1.0, -3.0]]
+
+
+def test_drift_of_a_straight_drive_by_hand():
+    # Segments end at the first frame beyond their length: 0-11, 10-21 and 0-21, a tenth of it too far.
+    report = score(straight(), ahead(31, 1.1), [10.0, 20.0])
+    assert report["frames"] == 31
+    assert report["drift"]["segments"] == 3
+    assert report["drift"]["t_err"] == pytest.approx((0.11 + 0.11 + 0.105) / 3)
+    assert report["drift"]["t_rmse"] == pytest.approx(np.sqrt((2 * 0.11**2 + 0.105**2) / 3))
+    assert report["drift"]["per_length"]["20"]["t_err"] == pytest.approx(0.105)
+    assert report["floor"]["t_err"] == pytest.approx(0, abs=1e-12)
+    assert report["distance_bias_m"] == pytest.approx(0.1)
+
+
+@pytest.mark.parametrize(("apply", "sides"), [("start", 0.0), ("middle", 0.5), ("end", 1.0)])
+def test_step_is_taken_where_asked_for(apply, sides):
+    # Two steps with a right angle at the first frame: the truth goes left at once (turned at the start).
+    sequence = drive([(0, 0, 0), (0, 2, np.pi / 2), (0, 4, np.pi / 2)])
+    off = 2 * np.abs(1j - np.exp(1j * sides * np.pi / 2))
+    report = score(sequence, sequence.motions, [3.0], apply)
+    assert report["drift"]["t_err"] == report["floor"]["t_err"] == pytest.approx(off / 3, abs=1e-12)
+
+
+def test_trajectory_is_in_the_frame_of_the_camera():
+    poses = camera_trajectory(straight(3), np.array([[2.0, np.pi / 2], [1.0, 0.0]]), "start")
+    # Ahead is z; left is -x.
+    np.testing.assert_allclose(poses[:, :3, 3], [(0, 0, 0), (0, 0, 2), (-1, 0, 2)], atol=1e-12)
+
+
+def test_camera_beside_the_laser_does_not_change_exact_motion():
+    shifted = FORWARD_CAMERA.copy()
+    shifted[:3, 3] = 0.3, -0.1, 0.5
+    angles = np.linspace(0, 3, 61)
+    planar = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
+    sequence = drive(planar, camera_from_laser=shifted)
+    exact = planar_drift(sequence, sequence.motions, [5.0, 10.0], "middle")
+    assert exact.segments > 5
+    assert exact.t_err == pytest.approx(0, abs=1e-9)
+
+
+def test_no_segment_is_no_score_and_a_dash():
+    sequences = [straight(name="long"), straight(6, name="short")]
+    motions = {"long": ahead(31, 1.1), "short": ahead(6, 1.1)}
+    report = score_all(sequences, motions, [20.0])
+    assert report["sequences"]["short"]["drift"]["t_err"] is None
+    assert report["sequences"]["short"]["drift"]["segments"] == 0
+    assert report["drift"] == pytest.approx(0.105)
+    assert report["lengths"] == [20.0]
+    lines = [line.split() for line in table({"cnn_reg": report, "held_motion": report}).splitlines()]
+    assert lines == [
+        ["drift", "in", "%", "long", "short", "mean"],
+        ["floor", "of", "two-number", "motion", "0.00", "-", "0.00"],
+        ["cnn_reg", "10.50", "-", "10.50"],
+        ["held_motion", "10.50", "-", "10.50"],
+        ["segments", "1", "0"],
+    ]
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_nothing_to_score_is_none():
+    report = score_all([straight(6)], {"straight": ahead(6, 1.0)}, [100.0])
+    assert report["drift"] is None
+    assert report["floor"] is None
+    assert "nan" not in table({"method": report})
+
+
+def test_mean_is_over_sequences():
+    sequences = [straight(31, "a"), straight(101, "b")]
+    motions = {"a": ahead(31, 1.1), "b": ahead(101, 1.2)}
+    report = score_all(sequences, motions, [10.0])
+    assert report["drift"] == pytest.approx((0.11 + 0.22) / 2)
+
+
+@pytest.mark.parametrize(("ratio", "text"), [(None, "-"), (0.0, "0.00"), (0.0255, "2.55"), (1.0, "100.00")])
+def test_percent(ratio, text):
+    assert percent(ratio) == text
+
+
+def test_baselines_repeat_one_motion():
+    scans = np.zeros((4, 3))
+    mean = mean_motion([[1.0, 0.1], [2.0, -0.3]]).estimate(scans)
+    np.testing.assert_allclose(mean, [[1.5, -0.1]] * 3)
+    np.testing.assert_array_equal(held_motion().estimate(scans), np.zeros((3, 2)))
+
+
+def test_odometry_that_never_moves_drifts_by_everything():
+    report = score(straight(), held_motion().estimate(np.zeros((31, 3))), [10.0])
+    assert report["drift"]["t_err"] == pytest.approx(1.1)

@@ -1,0 +1,238 @@
+"""Whole experiments on tiny recordings in the real layouts."""
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+import torch
+import yaml
+from conftest import ROOT
+from data.make_carmen import make_carmen
+from data.make_kitti import make_kitti
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+from evaluate import evaluate
+from rcnn_odom import cli, experiment
+from rcnn_odom.errors import InputError
+from rcnn_odom.runs import BEST, LAST
+from train import train
+
+VARIANTS = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
+LENGTHS = "data.lengths=[10.0,20.0]"
+
+
+@pytest.fixture(scope="module")
+def kitti(tmp_path_factory):
+    root = tmp_path_factory.mktemp("kitti")
+    make_kitti(root, ["00", "10", "05"], frames=60)
+    return [f"data.root={root}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
+
+
+@pytest.mark.parametrize("variant", VARIANTS)
+def test_a_run_leaves_everything_behind(configure, kitti, tmp_path, variant):
+    metrics = train(configure(f"model={variant}", *kitti))
+    run = tmp_path / "outputs" / "run"
+    assert (tmp_path / "outputs" / "latest").resolve() == run
+    assert json.loads((run / "metrics.json").read_text()) == metrics
+    assert yaml.safe_load((run / "config.yaml").read_text())["model"]["variant"] == variant
+    assert (run / BEST).exists()
+    assert not (run / LAST).exists()
+    for kind in ("trajectory", "motion"):
+        assert (run / "figures" / f"05_{kind}.png").stat().st_size > 10_000
+    assert len(np.loadtxt(run / "trajectories" / "05.txt")) == 60
+    assert np.loadtxt(run / "trajectories" / "05.tum").shape == (60, 8)
+    assert set(metrics["baselines"]) == {"mean_motion", "held_motion"}
+    assert metrics["test"]["sequences"]["05"]["drift"]["segments"] > 0
+    assert 0 <= metrics["test"]["floor"] < metrics["baselines"]["held_motion"]["drift"]
+
+
+def test_the_command_line_prints_the_drift_of_metrics_json(configure, kitti, tmp_path, capsys):
+    metrics = train(configure("model=cnn_reg", *kitti))
+    root = kitti[0].split("=")[1]
+    trajectory = tmp_path / "outputs" / "run" / "trajectories" / "05.txt"
+    arguments = [f"{root}/poses/05.txt", str(trajectory), "--planar", "--lengths", "10,20", "--json"]
+    assert cli.main(["drift", *arguments]) == 0
+    printed = json.loads(capsys.readouterr().out)
+    expected = metrics["test"]["sequences"]["05"]["drift"]
+    assert printed["segments"] == expected["segments"]
+    # Rotation is rounded to single precision inside, and the poses go through text.
+    assert printed["t_err"] == pytest.approx(expected["t_err"], rel=1e-6)
+    assert printed["r_err_deg_per_m"] == pytest.approx(expected["r_err_deg_per_m"], rel=1e-3)
+
+
+def test_tensorboard_has_losses_rate_drift_figures_and_hparams(configure, kitti, tmp_path):
+    metrics = train(configure("model=cnn_cls", *kitti))
+    events = EventAccumulator(str(tmp_path / "outputs" / "run" / "tensorboard"), {"tensors": 0, "images": 0})
+    events.Reload()
+    tags = events.Tags()
+    assert {
+        "train/loss_epoch",
+        "train/loss_distance_epoch",
+        "train/loss_rotation_epoch",
+        "train/learning_rate",
+        "val/drift",
+        "val/drift/10",
+        "val/distance_mae_m",
+        "val/heading_mae_deg",
+        "test/drift",
+    } <= set(tags["scalars"])
+    assert {"test/05_trajectory", "test/05_motion"} <= set(tags["images"])
+    assert events.Scalars("test/drift")[-1].value == pytest.approx(metrics["test"]["drift"], rel=1e-6)
+    hparams = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
+    assert b"model.kernel_size" in hparams
+
+
+def test_the_first_stage_is_trained_once_and_then_found(configure, kitti, tmp_path, caplog):
+    caplog.set_level("INFO")
+    train(configure("model=rcnn_reg", *kitti))
+    stage = tmp_path / "outputs" / "run" / "first_stage" / BEST
+    assert f"first stage: {stage}" in caplog.text
+    assert caplog.text.count("training one") == 1
+    train(configure("model=rcnn_cls", *kitti, run="second"))
+    assert caplog.text.count("training one") == 1
+    assert caplog.text.count(f"first stage: {stage}") == 2
+    train(configure("model=rcnn_reg", *kitti, "seed=1", run="third"))
+    assert caplog.text.count("training one") == 2
+
+
+def test_a_cnn_cls_run_serves_as_first_stage(configure, kitti, tmp_path, caplog):
+    caplog.set_level("INFO")
+    train(configure("model=cnn_cls", *kitti, "model.epochs=1", run="cnn"))
+    train(configure("model=rcnn_reg", *kitti))
+    assert f"first stage: {tmp_path / 'outputs' / 'cnn' / BEST}" in caplog.text
+
+
+def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(configure, kitti, tmp_path):
+    train(configure("model=cnn_cls", *kitti, run="cnn"))
+    stage = tmp_path / "outputs" / "cnn" / BEST
+    weights = torch.load(stage, weights_only=True)["state_dict"]
+    for freeze in (True, False):
+        run = f"freeze_{freeze}"
+        train(configure("model=rcnn_reg", *kitti, f"model.pretrained={stage}", f"model.freeze={freeze}", run=run))
+        after = torch.load(tmp_path / "outputs" / run / BEST, weights_only=True)["state_dict"]
+        same = [torch.equal(after[key.replace("network.", "network.cnn.")], weights[key]) for key in weights]
+        assert all(same) == freeze
+
+
+def test_evaluating_again_gives_the_same_numbers(configure, kitti, tmp_path):
+    trained = train(configure("model=rcnn_reg", *kitti))
+    again = evaluate(configure(f"run={tmp_path}/outputs/run", name="evaluate", run="evaluation"))
+    assert again["test"] == trained["test"]
+    assert again["baselines"] == trained["baselines"]
+    assert (tmp_path / "outputs" / "evaluation" / "metrics.json").exists()
+
+
+def test_evaluating_on_other_data(configure, kitti, tmp_path):
+    train(configure("model=cnn_reg", *kitti))
+    options = ["data=simulated", "data.reader.frames=50", "data.test=[07]", "data.sensor.resolution_deg=1.0"]
+    scores = evaluate(configure(f"run={tmp_path}/outputs/run", *options, name="evaluate", run="evaluation"))
+    assert scores["data"] == "simulated"
+    # 50 frames are shorter than 100 m: said, not scored.
+    assert scores["test"]["drift"] is None
+    assert scores["test"]["sequences"]["07"]["drift"]["segments"] == 0
+    assert scores["test"]["sequences"]["07"]["distance_mae_m"] > 0
+
+
+def test_carmen_logs_of_two_beam_counts_train_together(configure, tmp_path):
+    make_carmen(tmp_path / "logs", "narrow", beams=180, frames=80)
+    make_carmen(tmp_path / "logs", "wide", beams=361, frames=80, compress="bz2", seed=1)
+    options = [
+        "data=carmen",
+        f"data.root={tmp_path}/logs",
+        "data.train=['narrow[:0.8]',wide]",
+        "data.val=['narrow[0.8:]']",
+        "data.test=[wide]",
+    ]
+    metrics = train(configure("model=rcnn_reg", *options))
+    assert set(metrics["baselines"]) == {"mean_motion", "held_motion", "wheel_odometry"}
+    assert metrics["test"]["sequences"]["wide"]["moving"]["frames"] > 0
+
+
+def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, monkeypatch):
+    whole = train(configure("model=cnn_reg", *kitti, run="whole"))
+
+    def stop(self, trainer, module):
+        if trainer.current_epoch == 1:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment.EpochLines, "on_train_epoch_start", stop, raising=False)
+        with pytest.raises(InputError, match="goes on"):
+            train(configure("model=cnn_reg", *kitti))
+    assert (tmp_path / "outputs" / "run" / LAST).exists()
+    assert train(configure("model=cnn_reg", *kitti))["test"] == whole["test"]
+
+
+def test_a_run_folder_is_not_used_twice_or_for_something_else(configure, kitti, tmp_path):
+    train(configure("model=cnn_reg", *kitti))
+    with pytest.raises(InputError, match="finished run"):
+        train(configure("model=cnn_reg", *kitti))
+    (tmp_path / "outputs" / "run" / "metrics.json").unlink()
+    with pytest.raises(InputError, match="other settings"):
+        train(configure("model=cnn_reg", *kitti, "model.beta=3"))
+
+
+def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure, kitti, tmp_path):
+    train(configure("model=cnn_reg", *kitti, run="reg"))
+    train(configure("model=cnn_cls", *kitti, run="cls"))
+    runs = tmp_path / "outputs"
+    recurrent = ["model=rcnn_reg", *kitti]
+    for number, (run, option, message) in enumerate([
+        ("reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
+        ("cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
+        ("cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
+        ("missing", "seed=0", "no such checkpoint"),
+    ]):
+        with pytest.raises(InputError, match=message):
+            train(configure(*recurrent, f"model.pretrained={runs / run / BEST}", option, run=f"bad{number}"))
+    other = ["data=simulated", "data.reader.frames=20"]
+    with pytest.raises(InputError, match=r"resolution_deg=1\.0.*data has"):
+        evaluate(configure(f"run={runs}/reg", *other, name="evaluate", run="evaluation"))
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("trainer.accelerator=gpu", "accelerator=cpu"),
+        ("model.window=60", "training sequence 00 has 60 frames, a window needs 61"),
+        ("data.train=[]", "data.train names no sequence"),
+        ("data.val=['10[0.9:0.1]']", "two fractions"),
+        ("data.val=['10[0.99:]']", "two are needed"),
+        ("model.pooling=median", "choose one of avg, max"),
+        ("model.kernel_size=4", "must be odd"),
+        ("model.epochs=0", "whole number above 0"),
+        ("data.apply=never", "choose one of start, middle, end"),
+        ("data.sensor.resolution_deg=0.7", "no whole number of bins"),
+    ],
+)
+def test_bad_options_are_named(configure, kitti, option, message):
+    if option == "trainer.accelerator=gpu" and torch.cuda.is_available():
+        pytest.skip("this machine has the GPU that the test wants absent")
+    with pytest.raises(InputError, match=message):
+        train(configure("model=cnn_reg", *kitti, option))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (["train.py", "data=kitti"], "data.root is missing"),
+        (["train.py", "data=kitti", "data.root=nowhere"], "nowhere"),
+        (["train.py", "model.kernel=3"], "'kernel' is not in struct"),
+        (["train.py", "data=kiti"], "Could not find 'data/kiti'"),
+        (["evaluate.py", "run=nowhere"], "nowhere/config.yaml"),
+    ],
+)
+def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, arguments, message):
+    script, *options = arguments
+    command = [sys.executable, str(ROOT / script), *options, f"outputs={tmp_path}"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert message in done.stdout + done.stderr
+    assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_help_is_quick_because_it_does_not_import_torch():
+    code = "import sys, train; assert 'torch' not in sys.modules and 'lightning' not in sys.modules"
+    subprocess.run([sys.executable, "-c", code], cwd=ROOT, check=True, timeout=60)
