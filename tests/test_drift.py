@@ -57,7 +57,9 @@ def straight(frames, step=1.0):
 def devkit_angle(pose):
     """`rotationError` of evaluate_odometry.cpp: matrices in double, the angle in single precision."""
     a, b, c = (np.float32(pose[i, i]) for i in range(3))
-    return float(np.arccos(max(min(np.float32(0.5 * (float(a + b + c) - 1.0)), np.float32(1)), np.float32(-1))))
+    return float(
+        np.arccos(max(min(np.float32(0.5 * (float(a + b + c) - 1.0)), np.float32(1)), np.float32(-1)))
+    )
 
 
 def devkit_loop(truth, estimate, lengths, step=10):

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
 from conftest import ROOT
 from data.make_carmen import make_carmen
 from data.make_kitti import make_kitti
-from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
-
 from evaluate import evaluate
 from rcnn_odom import cli, experiment
 from rcnn_odom.errors import InputError
@@ -110,7 +110,11 @@ def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(configure, ki
     weights = torch.load(stage, weights_only=True)["state_dict"]
     for freeze in (True, False):
         run = f"freeze_{freeze}"
-        train(configure("model=rcnn_reg", *kitti, f"model.pretrained={stage}", f"model.freeze={freeze}", run=run))
+        train(
+            configure(
+                "model=rcnn_reg", *kitti, f"model.pretrained={stage}", f"model.freeze={freeze}", run=run
+            )
+        )
         after = torch.load(tmp_path / "outputs" / run / BEST, weights_only=True)["state_dict"]
         same = [torch.equal(after[key.replace("network.", "network.cnn.")], weights[key]) for key in weights]
         assert all(same) == freeze
@@ -179,12 +183,14 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
     train(configure("model=cnn_cls", *kitti, run="cls"))
     runs = tmp_path / "outputs"
     recurrent = ["model=rcnn_reg", *kitti]
-    for number, (run, option, message) in enumerate([
-        ("reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
-        ("cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
-        ("cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
-        ("missing", "seed=0", "no such checkpoint"),
-    ]):
+    for number, (run, option, message) in enumerate(
+        [
+            ("reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
+            ("cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
+            ("cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
+            ("missing", "seed=0", "no such checkpoint"),
+        ]
+    ):
         with pytest.raises(InputError, match=message):
             train(configure(*recurrent, f"model.pretrained={runs / run / BEST}", option, run=f"bad{number}"))
     other = ["data=simulated", "data.reader.frames=20"]

@@ -84,7 +84,10 @@ def encode_sequences(
         log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
         # Fresh processes: a fork of one that has started torch's threads can hang.
         pool = ProcessPoolExecutor(
-            workers, get_context("spawn"), initializer=_start_worker, initargs=(list(missing.values()), sensor)
+            workers,
+            get_context("spawn"),
+            initializer=_start_worker,
+            initargs=(list(missing.values()), sensor),
         )
         with pool, tqdm(total=total, desc="encoding scans", unit="scan", disable=None) as bar:
             for number, (path, sequence) in enumerate(missing.items()):
@@ -118,7 +121,9 @@ def _encode_frames(number: int, start: int, stop: int) -> npt.NDArray[np.float32
     return np.stack([encode(*read_scan(frame), sensor) for frame in range(start, stop)])
 
 
-def _write_cache(path: Path, number: int, shape: tuple[int, int], pool: ProcessPoolExecutor, bar: tqdm) -> None:
+def _write_cache(
+    path: Path, number: int, shape: tuple[int, int], pool: ProcessPoolExecutor, bar: tqdm
+) -> None:
     """The file gets its final name only when it is complete and on disk.
 
     A killed run therefore leaves nothing that a later one would believe.

@@ -20,7 +20,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import Report, percent
 from rcnn_odom.machine import keep_freed_memory, resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
-from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule
+from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
 from rcnn_odom.motion import change_frame
 from rcnn_odom.report import log_hyperparameters, report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, Settings, find_run, fingerprint, flat, start_run, write_json
@@ -68,7 +68,9 @@ def _check_options(group: str, options: Settings) -> None:
         if key in COUNTS and not (isinstance(value, int) and value > 0):
             raise InputError(f"{group}.{key}={value}: must be a whole number above 0")
         if key == "kernel_size" and value % 2 == 0:
-            raise InputError(f"{group}.{key}={value}: must be odd, so that a kernel has a middle; the paper uses 3")
+            raise InputError(
+                f"{group}.{key}={value}: must be odd, so that a kernel has a middle; the paper uses 3"
+            )
 
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
@@ -97,7 +99,9 @@ def build_module(settings: Settings, datamodule: OdometryDataModule) -> Odometry
     if lengths != data["lengths"]:
         log.info("validation is too short for data.lengths: its drift is measured over %s m", lengths)
     # A checkpoint tells what the network is, not where its first stage came from.
-    model = {key: value for key, value in settings["model"].items() if key not in ("first_stage", "pretrained")}
+    model = {
+        key: value for key, value in settings["model"].items() if key not in ("first_stage", "pretrained")
+    }
     L.seed_everything(settings["seed"], verbose=False)
     module = VARIANTS[model["variant"]](model, data["sensor"], {"lengths": lengths, "apply": data["apply"]})
     module.set_motion_statistics(*datamodule.motion_statistics())
@@ -178,7 +182,7 @@ def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.
     module = build_module(settings, datamodule)
     if last.exists():
         log.info("going on from %s", last)
-    elif module.recurrent:
+    elif isinstance(module, RecurrentModule):
         module.load_first_stage(first_stage(settings, datamodule))
     try:
         trainer.fit(

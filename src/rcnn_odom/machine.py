@@ -5,8 +5,8 @@ import sys
 
 import torch
 
-MALLOC_SETTINGS = {"M_MMAP_THRESHOLD": (-3, 1 << 30), "M_TRIM_THRESHOLD": (-1, 1 << 30), "M_TOP_PAD": (-2, 1 << 26)}
-"""glibc's ``mallopt`` numbers and values in bytes (its man page)."""
+M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
+"""Parameters of glibc's ``mallopt``, from its ``malloc.h``."""
 
 
 def keep_freed_memory() -> None:
@@ -16,9 +16,10 @@ def keep_freed_memory() -> None:
     """
     if sys.platform.startswith("linux"):
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-        for parameter, value in MALLOC_SETTINGS.values():
-            if mallopt is not None:
-                mallopt(parameter, value)
+        if mallopt is not None:
+            mallopt(M_MMAP_THRESHOLD, 1 << 30)
+            mallopt(M_TRIM_THRESHOLD, 1 << 30)
+            mallopt(M_TOP_PAD, 1 << 26)
 
 
 def resolve_precision(precision: str, accelerator: str) -> str:

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 from torchmetrics import MeanMetric
 
+from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.datamodule import Batch
 from rcnn_odom.evaluation import camera_trajectory, frame_errors
 from rcnn_odom.losses import Loss, classification_loss, regression_loss
@@ -35,10 +36,13 @@ class OdometryModule(L.LightningModule):
     variant: ClassVar[str]
     recurrent: ClassVar[bool]
     classifies: ClassVar[bool]
+    network: CNN | RCNN
 
     def __init__(self, model: Settings, sensor: Settings, scoring: Settings) -> None:
         super().__init__()
-        self.save_hyperparameters({"variant": self.variant, "model": model, "sensor": sensor, "scoring": scoring})
+        self.save_hyperparameters(
+            {"variant": self.variant, "model": model, "sensor": sensor, "scoring": scoring}
+        )
         self.model, self.scoring = model, scoring
         self.sensor = Sensor(**sensor)
         self.classes = RotationClasses(**model["rotation_classes"])
@@ -51,10 +55,16 @@ class OdometryModule(L.LightningModule):
         cnn_classes = self.classes if self.classifies or self.recurrent else None
         angle = model["angle"]
         cnn = CNN(
-            self.sensor.bins, self.sensor.max_range, cnn_classes, model["kernel_size"], model["pooling"], angle
+            self.sensor.bins,
+            self.sensor.max_range,
+            cnn_classes,
+            model["kernel_size"],
+            model["pooling"],
+            angle,
         )
         if not self.recurrent:
             return cnn
+        cnn.requires_grad_(not model["freeze"])
         head_classes = self.classes if self.classifies else None
         return RCNN(cnn, head_classes, model["hidden_size"], model["layers"], angle)
 
@@ -84,7 +94,9 @@ class OdometryModule(L.LightningModule):
         parts = {"train/loss": loss.total, "train/loss_distance": loss.distance}
         parts["train/loss_rotation"] = loss.rotation
         self.log_dict(parts, on_step=True, on_epoch=True, batch_size=batch_size)
-        self.log("train/learning_rate", self.optimizers().param_groups[0]["lr"], batch_size=batch_size)
+        self.log(
+            "train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=batch_size
+        )
 
     def configure_gradient_clipping(
         self,
@@ -115,14 +127,17 @@ class OdometryModule(L.LightningModule):
                 motions.append(estimate.motion[0].double().cpu().numpy())
         return np.concatenate(motions)
 
+    def _validation(self) -> list[EncodedSequence]:
+        return self.trainer.datamodule.sequences["val"]  # type: ignore[attr-defined]
+
     def on_validation_epoch_start(self) -> None:
-        """Metrics of this epoch; the lengths are those that fit the validation sequences."""
-        names = [sequence.name for sequence in self.trainer.datamodule.sequences["val"]]
+        """A metric for this epoch alone."""
+        names = [sequence.name for sequence in self._validation()]
         self.drift = DriftMetric(names, lengths=self.scoring["lengths"], planar=True).to(self.device)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Scores one whole sequence."""
-        sequence = self.trainer.datamodule.sequences["val"][batch["number"]]
+        sequence = self._validation()[batch["number"]]
         motions = self.estimate(batch["scans"])
         truth = change_frame(sequence.poses, sequence.camera_from_laser)
         self.drift.update(truth, camera_trajectory(sequence, motions, self.scoring["apply"]), sequence.name)
@@ -167,28 +182,30 @@ class CNNClassification(OdometryModule):
     variant, recurrent, classifies = "cnn_cls", False, True
 
 
-class _Recurrent(OdometryModule):
+class RecurrentModule(OdometryModule):
+    """A first stage, then an LSTM."""
+
     recurrent = True
 
     def load_first_stage(self, cnn: CNNClassification) -> None:
-        """Takes the weights of a trained CNN; with ``model.freeze`` they are not trained further."""
+        """Takes the weights of a trained CNN."""
+        assert isinstance(self.network, RCNN)
         self.network.cnn.load_state_dict(cnn.network.state_dict())
-        if self.model["freeze"]:
-            self.network.cnn.requires_grad_(False)
 
 
-class RCNNRegression(_Recurrent):
+class RCNNRegression(RecurrentModule):
     """Eq. 3 after the LSTM: the paper's best."""
 
     variant, classifies = "rcnn_reg", False
 
 
-class RCNNClassification(_Recurrent):
+class RCNNClassification(RecurrentModule):
     """Eq. 4 after the LSTM."""
 
     variant, classifies = "rcnn_cls", True
 
 
 VARIANTS: dict[str, type[OdometryModule]] = {
-    module.variant: module for module in (CNNRegression, CNNClassification, RCNNRegression, RCNNClassification)
+    module.variant: module
+    for module in (CNNRegression, CNNClassification, RCNNRegression, RCNNClassification)
 }

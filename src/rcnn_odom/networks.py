@@ -77,7 +77,8 @@ class Encoder(nn.Module):
             nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
             layers += [convolution, nn.ReLU(inplace=True)]
             length, inputs = (length - 1) // stride + 1, channels
-        self.layers = nn.Sequential(*layers).to(memory_format=torch.channels_last)
+        self.layers = nn.Sequential(*layers)
+        self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.features = inputs * length
 
     def forward(self, pairs: Tensor) -> Tensor:
@@ -103,6 +104,10 @@ class MotionHead(nn.Module):
         classes: rotation as classification; None for regression.
         angle: class scores become an angle by ``expectation`` over the classes, or ``argmax``.
     """
+
+    centres: Tensor | None
+    mean: Tensor
+    deviation: Tensor
 
     def __init__(
         self, features: int, classes: RotationClasses | None, angle: Literal["expectation", "argmax"]

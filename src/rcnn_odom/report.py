@@ -100,6 +100,10 @@ def write_sequence(
 def log_hyperparameters(trainer: L.Trainer, settings: Settings, metrics: Report) -> None:
     """The row of TensorBoard's HParams tab: every setting, and drift as its metric."""
     scores = {"val/drift": metrics["val"]["drift"], "test/drift": metrics["test"]["drift"]}
-    parameters = {name: str(value) if isinstance(value, list) else value for name, value in flat(settings).items()}
+    parameters = {
+        name: str(value) if isinstance(value, list) else value for name, value in flat(settings).items()
+    }
     assert trainer.logger is not None
-    trainer.logger.log_hyperparams(parameters, {name: value for name, value in scores.items() if value is not None})
+    trainer.logger.log_hyperparams(
+        parameters, {name: value for name, value in scores.items() if value is not None}
+    )

@@ -31,7 +31,9 @@ def start_run(run: Path, settings: Settings) -> None:
     if (run / METRICS).exists():
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
     if config.exists() and yaml.safe_load(config.read_text()) != settings:
-        raise InputError(f"{config}: the run was begun with other settings; repeat them, or choose another run_dir")
+        raise InputError(
+            f"{config}: the run was begun with other settings; repeat them, or choose another run_dir"
+        )
     try:
         run.mkdir(parents=True, exist_ok=True)
         config.write_text(yaml.safe_dump(settings, sort_keys=False))
@@ -56,7 +58,9 @@ def read_settings(run: Path) -> Settings:
     try:
         return yaml.safe_load((run / CONFIG).read_text())
     except OSError as error:
-        raise InputError(f"{run / CONFIG}: {error.strerror}; name the folder of a run, run=outputs/...") from error
+        raise InputError(
+            f"{run / CONFIG}: {error.strerror}; name the folder of a run, run=outputs/..."
+        ) from error
 
 
 def flat(settings: Settings, prefix: str = "") -> Settings:

@@ -31,7 +31,9 @@ class Sensor:
                 f"whole number of bins of {self.resolution_deg} degrees; change data.sensor"
             )
         if not 0 < self.max_range < float("inf"):
-            raise InputError(f"sensor: data.sensor.max_range must be positive and finite, not {self.max_range}")
+            raise InputError(
+                f"sensor: data.sensor.max_range must be positive and finite, not {self.max_range}"
+            )
 
     @property
     def bins(self) -> int:
