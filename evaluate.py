@@ -4,13 +4,11 @@ import logging
 import sys
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from rcnn_odom.errors import InputError
+from rcnn_odom.job import run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
-failed: list[InputError] = []
 
 
 def evaluate(cfg: DictConfig) -> dict:
@@ -43,16 +41,10 @@ def evaluate(cfg: DictConfig) -> dict:
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")
 def main(cfg: DictConfig) -> float | None:
-    """Runs one job and gives its drift."""
-    cfg.run_dir = HydraConfig.get().runtime.output_dir
-    try:
-        return evaluate(cfg)["test"]["drift"]
-    except InputError as error:
-        log.error("error: %s", error)
-        failed.append(error)
-        return None
+    """Runs one job; its test drift."""
+    metrics = run_job(evaluate, cfg)
+    return None if metrics is None else metrics["test"]["drift"]
 
 
 if __name__ == "__main__":
-    main()
-    sys.exit(1 if failed else 0)
+    sys.exit(run_command(main))

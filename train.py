@@ -4,13 +4,11 @@ import logging
 import sys
 
 import hydra
-from hydra.core.hydra_config import HydraConfig
 from omegaconf import DictConfig
 
-from rcnn_odom.errors import InputError
+from rcnn_odom.job import run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
-failed: list[InputError] = []
 
 
 def train(cfg: DictConfig) -> dict:
@@ -18,6 +16,7 @@ def train(cfg: DictConfig) -> dict:
 
     Raises:
         InputError: see its message.
+        KeyboardInterrupt: stopped from the keyboard or by a signal; the log says how to go on.
     """
     # Here and not above: `--help` and a mistyped option should not wait for torch.
     from pathlib import Path
@@ -30,24 +29,21 @@ def train(cfg: DictConfig) -> dict:
     runs.start_run(run, settings)
     runs.point_latest(Path(settings["outputs"]), run)
     datamodule = experiment.build_datamodule(settings).load()
-    metrics = experiment.train_module(settings, datamodule, trainer)
+    try:
+        metrics = experiment.train_module(settings, datamodule, trainer)
+    except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after the former
+        log.error("stopped; the same command with run_dir=%s goes on", run)
+        raise KeyboardInterrupt from None
     log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
     return metrics
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
-    """Runs one job; the validation drift is what a sweep would minimise."""
-    cfg.run_dir = HydraConfig.get().runtime.output_dir
-    try:
-        return train(cfg)["val"]["drift"]
-    except InputError as error:
-        # Remembered rather than raised: the other jobs of a sweep go on.
-        log.error("error: %s", error)
-        failed.append(error)
-        return None
+    """Runs one job; its validation drift is what a sweep would minimise."""
+    metrics = run_job(train, cfg)
+    return None if metrics is None else metrics["val"]["drift"]
 
 
 if __name__ == "__main__":
-    main()
-    sys.exit(1 if failed else 0)
+    sys.exit(run_command(main))

@@ -154,7 +154,7 @@ def test_carmen_logs_of_two_beam_counts_train_together(configure, tmp_path):
     assert metrics["test"]["sequences"]["wide"]["moving"]["frames"] > 0
 
 
-def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, monkeypatch):
+def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, monkeypatch, caplog):
     whole = train(configure("model=cnn_reg", *kitti, run="whole"))
 
     def stop(self, trainer, module):
@@ -163,8 +163,9 @@ def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, mo
 
     with monkeypatch.context() as patch:
         patch.setattr(experiment.EpochLines, "on_train_epoch_start", stop, raising=False)
-        with pytest.raises(InputError, match="goes on"):
+        with pytest.raises(KeyboardInterrupt):
             train(configure("model=cnn_reg", *kitti))
+    assert f"run_dir={tmp_path}/outputs/run goes on" in caplog.text
     assert (tmp_path / "outputs" / "run" / LAST).exists()
     assert train(configure("model=cnn_reg", *kitti))["test"] == whole["test"]
 
@@ -208,6 +209,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
         ("data.val=['10[0.99:]']", "two are needed"),
         ("model.pooling=median", "choose one of avg, max"),
         ("model.kernel_size=4", "must be odd"),
+        ("model.beta=much", "must be a number above 0"),
         ("model.epochs=0", "whole number above 0"),
         ("data.apply=never", "choose one of start, middle, end"),
         ("data.sensor.resolution_deg=0.7", "no whole number of bins"),
@@ -225,7 +227,7 @@ def test_bad_options_are_named(configure, kitti, option, message):
     [
         (["train.py", "data=kitti"], "data.root is missing"),
         (["train.py", "data=kitti", "data.root=nowhere"], "nowhere"),
-        (["train.py", "model.kernel=3"], "'kernel' is not in struct"),
+        (["train.py", "model.kernel=3"], "Could not override 'model.kernel'"),
         (["train.py", "data=kiti"], "Could not find 'data/kiti'"),
         (["evaluate.py", "run=nowhere"], "nowhere/config.yaml"),
     ],

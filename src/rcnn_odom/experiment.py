@@ -38,7 +38,8 @@ CHOICES = {
     "angle": ("expectation", "argmax"),
     "apply": ("start", "middle", "end"),
 }
-COUNTS = ("kernel_size", "hidden_size", "layers", "epochs", "window", "batch_size")
+NUMBERS = ("width_deg", "beta", "learning_rate")
+COUNTS = ("count", "kernel_size", "hidden_size", "layers", "epochs", "window", "batch_size")
 
 
 def plain(cfg: DictConfig) -> Settings:
@@ -67,6 +68,10 @@ def _check_options(group: str, options: Settings) -> None:
             raise InputError(f"{group}.{key}={value}: choose one of {', '.join(CHOICES[key])}")
         if key in COUNTS and not (isinstance(value, int) and value > 0):
             raise InputError(f"{group}.{key}={value}: must be a whole number above 0")
+        if key in NUMBERS and not (isinstance(value, int | float) and value > 0):
+            raise InputError(f"{group}.{key}={value}: must be a number above 0")
+        if key in ("first_stage", "rotation_classes"):
+            _check_options(f"{group}.{key}", value)
         if key == "kernel_size" and value % 2 == 0:
             raise InputError(
                 f"{group}.{key}={value}: must be odd, so that a kernel has a middle; the paper uses 3"
@@ -173,9 +178,6 @@ def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.
 
     Returns:
         What ``metrics.json`` holds.
-
-    Raises:
-        InputError: stopped from the keyboard; the message says how to go on.
     """
     run = Path(settings["run_dir"])
     last = run / LAST
@@ -184,12 +186,7 @@ def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.
         log.info("going on from %s", last)
     elif isinstance(module, RecurrentModule):
         module.load_first_stage(first_stage(settings, datamodule))
-    try:
-        trainer.fit(
-            module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
-        )
-    except SystemExit:  # how Lightning ends after Ctrl-C
-        raise InputError(f"stopped; the same command with run_dir={run} goes on") from None
+    trainer.fit(module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True)
     metrics = {"fingerprint": fingerprint(settings, datamodule), "seed": settings["seed"]}
     metrics |= finish_run(settings, datamodule, trainer, run)
     log_hyperparameters(trainer, settings, metrics)

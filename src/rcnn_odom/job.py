@@ -1,0 +1,50 @@
+"""What stands around a Hydra job: mistakes of the user become one line and an exit status."""
+
+import logging
+import os
+import re
+import sys
+from collections.abc import Callable
+from typing import TypeVar
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig
+from omegaconf.errors import OmegaConfBaseException
+
+from rcnn_odom.errors import InputError
+
+log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+_failed: list[InputError] = []
+
+
+def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
+    """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
+
+    The mistake is remembered for :func:`run_command` and not raised: the other jobs of a sweep go on.
+    """
+    cfg.run_dir = HydraConfig.get().runtime.output_dir
+    try:
+        return job(cfg)
+    except InputError as error:
+        log.error("error: %s", error)
+        _failed.append(error)
+        return None
+
+
+def run_command(main: Callable[[], object]) -> int:
+    """Runs a function decorated with ``hydra.main``; the exit status: 1 after a mistake of the user."""
+    # Hydra would print and exit by itself, also where a folder cannot be made.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    try:
+        main()
+    except KeyboardInterrupt:
+        return 130
+    except (HydraException, OmegaConfBaseException, OSError) as error:
+        # What follows is Hydra's own place in the configuration, not the user's mistake.
+        message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
+        print("error:", " ".join(message.split()), file=sys.stderr)
+        return 1
+    return 1 if _failed else 0
