@@ -64,14 +64,15 @@ def plain(cfg: DictConfig) -> Settings:
 
 def _check_options(group: str, options: Settings) -> None:
     for key, value in options.items():
+        if isinstance(value, dict):
+            _check_options(f"{group}.{key}", value)
+            continue
         if key in CHOICES and value not in CHOICES[key]:
             raise InputError(f"{group}.{key}={value}: choose one of {', '.join(CHOICES[key])}")
         if key in COUNTS and not (isinstance(value, int) and value > 0):
             raise InputError(f"{group}.{key}={value}: must be a whole number above 0")
         if key in NUMBERS and not (isinstance(value, int | float) and value > 0):
             raise InputError(f"{group}.{key}={value}: must be a number above 0")
-        if key in ("first_stage", "rotation_classes"):
-            _check_options(f"{group}.{key}", value)
         if key == "kernel_size" and value % 2 == 0:
             raise InputError(
                 f"{group}.{key}={value}: must be odd, so that a kernel has a middle; the paper uses 3"
