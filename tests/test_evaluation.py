@@ -5,7 +5,7 @@ import json
 import numpy as np
 import pytest
 
-from rcnn_odom.baselines.constant import held_motion, mean_motion
+from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.evaluation import (
     camera_trajectory,
@@ -156,7 +156,7 @@ def test_percent(ratio, text):
 
 def test_baselines_repeat_one_motion():
     scans = np.zeros((4, 3))
-    mean = mean_motion([[1.0, 0.1], [2.0, -0.3]]).estimate(scans)
+    mean = ConstantMotion(np.array([1.5, -0.1])).estimate(scans)
     np.testing.assert_allclose(mean, [[1.5, -0.1]] * 3)
     np.testing.assert_array_equal(held_motion().estimate(scans), np.zeros((3, 2)))
 

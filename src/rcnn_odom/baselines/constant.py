@@ -10,7 +10,7 @@ from rcnn_odom.motion import FloatArray
 
 @dataclass(frozen=True)
 class ConstantMotion:
-    """The same motion for every pair of scans, whatever they show.
+    """The same motion for every pair of scans: the training set's mean, for instance.
 
     Attributes:
         motion: (2,) metres and radians.
@@ -21,11 +21,6 @@ class ConstantMotion:
     def estimate(self, scans: npt.ArrayLike) -> FloatArray:
         """Motions (N-1, 2) for scans (N, bins)."""
         return np.tile(self.motion, (len(np.asarray(scans)) - 1, 1))
-
-
-def mean_motion(motions: npt.ArrayLike) -> ConstantMotion:
-    """Repeats the mean of the training set's motions (N, 2)."""
-    return ConstantMotion(np.asarray(motions, dtype=np.float64).mean(0))
 
 
 def held_motion() -> ConstantMotion:

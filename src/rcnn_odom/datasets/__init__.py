@@ -1,0 +1,1 @@
+"""Recordings on disk: one file, one format; each gives the same `Sequence`."""
