@@ -23,8 +23,9 @@ def evaluate(cfg: DictConfig) -> dict:
     from rcnn_odom.checkpoint import load_module
     from rcnn_odom.report import report_test
     from rcnn_odom.scan import Sensor
+    from rcnn_odom.settings import plain
 
-    chosen = experiment.plain(cfg)
+    chosen = plain(cfg)
     run, folder = Path(chosen["run"]), Path(chosen["run_dir"])
     settings = runs.read_settings(run)
     settings |= {key: chosen[key] for key in ("data", "trainer", "outputs") if chosen.get(key)}

@@ -22,13 +22,14 @@ def train(cfg: DictConfig) -> dict:
     from pathlib import Path
 
     from rcnn_odom import experiment, runs
+    from rcnn_odom.settings import plain
 
-    settings = experiment.plain(cfg)
+    settings = plain(cfg)
     run = Path(settings["run_dir"])
     trainer = experiment.build_trainer(settings, run)
     runs.start_run(run, settings)
-    runs.point_latest(Path(settings["outputs"]), run)
     datamodule = experiment.build_datamodule(settings).load()
+    runs.point_latest(Path(settings["outputs"]), run)
     try:
         metrics = experiment.train_module(settings, datamodule, trainer)
     except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after the former

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
+from hydra.utils import instantiate
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from conftest import ROOT
@@ -16,7 +17,9 @@ from data.make_kitti import make_kitti
 from evaluate import evaluate
 from rcnn_odom import cli, experiment
 from rcnn_odom.errors import InputError
-from rcnn_odom.runs import BEST, LAST
+from rcnn_odom.metrics.drift import travelled
+from rcnn_odom.runs import BEST, LAST, fingerprint
+from rcnn_odom.settings import plain
 from train import train
 
 VARIANTS = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
@@ -134,7 +137,7 @@ def test_evaluating_again_gives_the_same_numbers(configure, kitti, tmp_path):
 
 def test_evaluating_on_other_data(configure, kitti, tmp_path):
     train(configure("model=cnn_reg", *kitti))
-    options = ["data=simulated", "data.reader.frames=50", "data.test=[07]", "data.sensor.resolution_deg=1.0"]
+    options = ["data=simulated", "data.frames=50", "data.test=[07]", "data.sensor.resolution_deg=1.0"]
     scores = evaluate(configure(f"run={tmp_path}/outputs/run", *options, name="evaluate", run="evaluation"))
     assert scores["data"] == "simulated"
     # 50 frames are shorter than 100 m: said, not scored.
@@ -198,7 +201,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
     ):
         with pytest.raises(InputError, match=message):
             train(configure(*recurrent, f"model.pretrained={runs / run / BEST}", option, run=f"bad{number}"))
-    other = ["data=simulated", "data.reader.frames=20"]
+    other = ["data=simulated", "data.frames=20"]
     with pytest.raises(InputError, match=r"resolution_deg=1\.0.*data has"):
         evaluate(configure(f"run={runs}/reg", *other, name="evaluate", run="evaluation"))
 
@@ -207,8 +210,21 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
     ("option", "message"),
     [
         ("trainer.accelerator=gpu", "accelerator=cpu"),
+        ("trainer.precision=16-mixed", "use bf16-mixed"),
+        ("trainer.precision=good", "precision=auto"),
+        ("trainer.devices=2", "one device"),
+        ("data.train=00", "must list sequences"),
+        ("data.val=['10','10']", "each once"),
+        ("data.sensor.max_range=far", "must be a number above 0"),
+        ("data.augment.mirror=maybe", "must be true or false"),
+        ("data.augment.max_turn_deg=abc", "must be 0 or a positive number"),
+        ("data.workers=-1", "must be null or a whole number"),
+        ("data.ring=-1", "data.ring must be 0 to 3"),
+        ("data.sensor.resolution_deg=60.0", "too few for the network"),
+        ("seed=-1", "not negative"),
+        ("model.epochs=true", "whole number above 0"),
         ("model.window=60", "training sequence 00 has 60 frames, a window needs 61"),
-        ("data.train=[]", "data.train names no sequence"),
+        ("data.train=[]", "must list sequences"),
         ("data.val=['10[0.9:0.1]']", "two fractions"),
         ("data.val=['10[0.99:]']", "two are needed"),
         ("model.pooling=median", "choose one of avg, max"),
@@ -224,6 +240,62 @@ def test_bad_options_are_named(configure, kitti, option, message):
         pytest.skip("this machine has the GPU that the test wants absent")
     with pytest.raises(InputError, match=message):
         train(configure("model=cnn_reg", *kitti, option))
+
+
+def test_numbers_serve_as_names_of_sequences(configure, kitti):
+    assert plain(configure("model=cnn_reg", *kitti, "data.val=[10]"))["data"]["val"] == ["10"]
+
+
+def test_bad_input_leaves_latest_where_it_was(configure, kitti, tmp_path):
+    train(configure("model=cnn_reg", *kitti, run="good"))
+    with pytest.raises(InputError):
+        train(configure("model=cnn_reg", *kitti, "data.root=nowhere", run="bad"))
+    assert (tmp_path / "outputs" / "latest").resolve() == tmp_path / "outputs" / "good"
+
+
+def test_parts_of_one_drive_have_files_of_their_own(configure, kitti, tmp_path):
+    train(configure("model=cnn_reg", *kitti, "data.test=['05[:0.5]','05[0.5:]']"))
+    assert len(list((tmp_path / "outputs" / "run" / "trajectories").glob("05*.txt"))) == 2
+
+
+def test_moving_a_drive_from_training_to_validation_asks_for_another_first_stage(configure, kitti, tmp_path):
+    prints = set()
+    for split in (
+        ["data.train=['00','10']", "data.val=['05']"],
+        ["data.train=['00']", "data.val=['10','05']"],
+    ):
+        settings = plain(configure("model=cnn_cls", *kitti, *split))
+        prints.add(fingerprint(settings, experiment.build_datamodule(settings).load(("train", "val"))))
+    assert len(prints) == 2
+
+
+@pytest.mark.parametrize("augmented", ["false", "true"])
+def test_training_in_bf16_learns_a_drive_by_heart(configure, kitti, augmented):
+    options = ["data.val=['00']", "data.test=['00']", "model.epochs=40", "trainer.precision=bf16-mixed"]
+    options += [f"data.augment.mirror={augmented}", f"data.augment.max_turn_deg={int(augmented == 'true')}"]
+    metrics = train(configure("model=cnn_reg", *kitti, *options))
+    assert metrics["test"]["drift"] < metrics["baselines"]["mean_motion"]["drift"] / 2
+
+
+def test_training_that_diverges_says_so(configure, kitti):
+    with pytest.raises(InputError, match=r"diverged in epoch \d.*learning_rate lower"):
+        train(
+            configure("model=cnn_reg", *kitti, "model.learning_rate=1e30", "trainer.gradient_clip_val=null")
+        )
+
+
+@pytest.mark.parametrize("split", ["val", "test"])
+def test_the_shipped_simulation_has_long_drives(configure, split):
+    data = plain(configure("data=simulated"))["data"]
+    for name in data[split]:
+        assert travelled(instantiate(data["reader"], name).poses)[-1] > 800
+
+
+@pytest.mark.parametrize("content", ["", "{", "a: 1", "[1]"])
+def test_a_foreign_configuration_is_refused(configure, tmp_path, content):
+    (tmp_path / "config.yaml").write_text(content)
+    with pytest.raises(InputError, match=r"config\.yaml: not the configuration of a run"):
+        evaluate(configure(f"run={tmp_path}", name="evaluate", run="evaluation"))
 
 
 @pytest.mark.parametrize(
@@ -243,6 +315,13 @@ def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, argum
     assert done.returncode == 1
     assert message in done.stdout + done.stderr
     assert "Traceback" not in done.stdout + done.stderr
+
+
+def test_help_prints_the_options():
+    command = [sys.executable, str(ROOT / "train.py"), "--help"]
+    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    assert "data: _common, carmen, kitti, simulated" in done.stdout
+    assert "kernel_size: 3" in done.stdout
 
 
 def test_help_is_quick_because_it_does_not_import_torch():

@@ -125,7 +125,7 @@ def test_ring_starts(azimuths: tuple[float, ...], starts: list[int]) -> None:
 @pytest.mark.parametrize(
     ("path", "match"),
     [
-        ("poses/00.txt", r"poses/00\.txt: no such file; the ground truth .*none for sequences 11 to 21"),
+        ("poses/00.txt", r"poses/00\.txt: no such file; the ground truth .*none for 11 to 21"),
         ("sequences/00/calib.txt", r"calib\.txt: no such file"),
         ("sequences/00/times.txt", r"times\.txt: no such file"),
     ],
@@ -188,10 +188,19 @@ def test_bad_calibration(root: Path, line: str, match: str) -> None:
         kitti.load("00", root=root)
 
 
-@pytest.mark.parametrize("line", ["1 0 0", "1 0 0 0 0 1 0 0 0 0 1 nan", "1 0 0 0 0 1 0 0 0 0 1 x", ""])
-def test_bad_pose(root: Path, line: str) -> None:
+@pytest.mark.parametrize(
+    ("line", "match"),
+    [
+        ("1 0 0", "12 numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 nan", "must be finite"),
+        ("1 0 0 0 0 1 0 0 0 0 1 x", "12 numbers"),
+        ("0 0 0 0 0 0 0 0 0 0 0 0", "must be a rotation"),
+        ("", "12 numbers"),
+    ],
+)
+def test_bad_pose(root: Path, line: str, match: str) -> None:
     replace_line(root / "poses" / "00.txt", 3, line)
-    with pytest.raises(InputError, match=r"00\.txt:3: expected 12 finite numbers"):
+    with pytest.raises(InputError, match=r"00\.txt:3: .*" + match):
         kitti.load("00", root=root)
 
 
@@ -211,10 +220,24 @@ def test_numbers_that_disagree(root: Path, path: str) -> None:
 
 
 def test_frame_without_the_ring(root: Path) -> None:
-    with pytest.raises(InputError, match=r"000001\.bin: frame 1 has 4 rings, so no ring 4"):
-        kitti.load("00", root=root, ring=4).read_scan(1)
-    with pytest.raises(InputError, match=r"data\.ring must be 0 or more"):
-        kitti.load("00", root=root, ring=-1)
+    for ring in (-1, 4):
+        with pytest.raises(InputError, match=r"data\.ring must be 0 to 3"):
+            kitti.load("00", root=root, ring=ring)
+    sequence = kitti.load("00", root=root, ring=3)
+    points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
+    points[: kitti.ring_starts(points)[2]].tofile(scan_file(root, 1))
+    with pytest.raises(InputError, match=r"000001\.bin: frame 1 has 2 rings, so no ring 3"):
+        sequence.read_scan(1)
+
+
+def test_frame_with_a_ring_too_many_gives_the_same_laser(root: Path) -> None:
+    sequence = kitti.load("00", root=root)
+    expected = sequence.read_scan(1)
+    points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
+    first_ring = points[: kitti.ring_starts(points)[1]]
+    np.concatenate([first_ring, points]).tofile(scan_file(root, 1))
+    for found, wanted in zip(sequence.read_scan(1), expected, strict=True):
+        np.testing.assert_array_equal(found, wanted)
 
 
 def test_scan_cut_off_after_loading(root: Path) -> None:

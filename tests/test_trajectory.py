@@ -44,11 +44,11 @@ def yawed(angle):
 
 def test_read_kitti_by_hand(tmp_path):
     path = tmp_path / "poses.txt"
-    path.write_text("1 2 3 4 5 6 7 8 9 10 11 12\n" + ROW.replace(" ", "\t") + "  \n\n\n")
+    path.write_text("0 -1 0 4 1 0 0 8 0 0 1 12\n" + ROW.replace(" ", "\t") + "  \n\n\n")
     poses = read_kitti(str(path))
     assert poses.shape == (2, 4, 4)
     assert poses.dtype == np.float64
-    np.testing.assert_array_equal(poses[0], [[1, 2, 3, 4], [5, 6, 7, 8], [9, 10, 11, 12], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(poses[0], [[0, -1, 0, 4], [1, 0, 0, 8], [0, 0, 1, 12], [0, 0, 0, 1]])
     np.testing.assert_array_equal(poses[1], np.eye(4))
 
 

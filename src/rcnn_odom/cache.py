@@ -15,7 +15,8 @@ import numpy.typing as npt
 from tqdm import tqdm
 
 from rcnn_odom.datasets.sequence import Sequence
-from rcnn_odom.motion import FloatArray, relative_motions
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import FloatArray, change_frame, relative_motions
 from rcnn_odom.scan import Sensor, encode
 
 log = logging.getLogger(__name__)
@@ -48,6 +49,11 @@ class EncodedSequence:
         """True motions (N-1, 2) in metres and radians."""
         return relative_motions(self.poses)
 
+    @property
+    def camera_poses(self) -> FloatArray:
+        """True poses (N, 4, 4) in the frame of the trajectory files."""
+        return change_frame(self.poses, self.camera_from_laser)
+
     def part(self, start: int, stop: int, name: str | None = None) -> "EncodedSequence":
         """Frames start..stop-1, without a copy."""
         wheel = self.wheel_odometry
@@ -74,12 +80,21 @@ def encode_sequences(
     """The sequences with their depth vectors, from the cache or computed into it in parallel.
 
     Raises:
-        InputError: a frame cannot be read.
+        InputError: a frame cannot be read, or the folder cannot be made.
     """
     paths = [cache_path(sequence, sensor, folder) for sequence in sequences]
-    missing = {path: sequence for path, sequence in zip(paths, sequences, strict=True) if not path.exists()}
+    missing = {
+        path: sequence
+        for path, sequence in zip(paths, sequences, strict=True)
+        if not _is_whole(path, (len(sequence), sensor.bins))
+    }
     if missing:
-        folder.mkdir(parents=True, exist_ok=True)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise InputError(
+                f"{folder}: cannot hold encoded scans ({error.strerror}); set outputs="
+            ) from error
         total = sum(len(sequence) for sequence in missing.values())
         log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
         # Fresh processes: a fork of one that has started torch's threads can hang.
@@ -104,6 +119,16 @@ def encode_sequences(
         )
         for path, sequence in zip(paths, sequences, strict=True)
     ]
+
+
+def _is_whole(path: Path, shape: tuple[int, int]) -> bool:
+    try:
+        return np.load(path, mmap_mode="r").shape == shape
+    except FileNotFoundError:
+        return False
+    except ValueError:
+        log.warning("%s: damaged, encoding it again", path)
+        return False
 
 
 _work: tuple[list[Sequence], Sensor]

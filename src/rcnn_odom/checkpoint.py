@@ -29,7 +29,7 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
     except FileNotFoundError:
         raise InputError(f"{path}: no such checkpoint") from None
     except Exception as error:  # whatever the bytes of a stranger's file lead to
-        reason = str(error).strip().splitlines()[0] if str(error).strip() else type(error).__name__
+        reason = f"{type(error).__name__}: {error}".splitlines()[0]
         raise InputError(f"{path}: not a checkpoint of this project ({reason})") from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")

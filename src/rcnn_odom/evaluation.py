@@ -25,8 +25,8 @@ def planar_drift(
     sequence: EncodedSequence, motions: FloatArray, lengths: list[float], apply: ApplyStep
 ) -> Drift:
     """Drift of motions (N-1, 2) over one sequence, as ``rcnn-odom drift --planar`` prints it."""
-    truth = change_frame(sequence.poses, sequence.camera_from_laser)
-    return drift(truth, camera_trajectory(sequence, motions, apply), planar=True, lengths=lengths)
+    estimate = camera_trajectory(sequence, motions, apply)
+    return drift(sequence.camera_poses, estimate, planar=True, lengths=lengths)
 
 
 def score(

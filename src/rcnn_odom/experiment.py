@@ -11,8 +11,6 @@ from hydra.utils import instantiate
 from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
-from omegaconf import DictConfig, OmegaConf
-from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.checkpoint import load_module
 from rcnn_odom.datamodule import OdometryDataModule
@@ -21,62 +19,16 @@ from rcnn_odom.evaluation import Report, percent
 from rcnn_odom.machine import keep_freed_memory, resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
-from rcnn_odom.motion import change_frame
 from rcnn_odom.report import log_hyperparameters, report_test
-from rcnn_odom.runs import BEST, LAST, METRICS, Settings, find_run, fingerprint, flat, start_run, write_json
+from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
 from rcnn_odom.scan import Sensor
+from rcnn_odom.settings import Settings
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
 # Lightning tells of the machine and of its makers' products; what a user needs is said by this project.
 logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
 warnings.filterwarnings("ignore", module=r"lightning\.pytorch")
-
-
-CHOICES = {
-    "pooling": ("avg", "max"),
-    "angle": ("expectation", "argmax"),
-    "apply": ("start", "middle", "end"),
-}
-NUMBERS = ("width_deg", "beta", "learning_rate")
-COUNTS = ("count", "kernel_size", "hidden_size", "layers", "epochs", "window", "batch_size")
-
-
-def plain(cfg: DictConfig) -> Settings:
-    """A configuration as plain numbers, strings, lists and dictionaries.
-
-    Raises:
-        InputError: a value that the user must give is missing, or one has no meaning.
-    """
-    written = OmegaConf.to_container(cfg)
-    for key, value in flat(written).items():  # type: ignore[arg-type]
-        if value == "???":
-            raise InputError(f"{key} is missing; give it on the command line, {key}=...")
-    try:
-        settings = OmegaConf.to_container(cfg, resolve=True)
-    except OmegaConfBaseException as error:
-        raise InputError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
-    assert isinstance(settings, dict)
-    for group in ("data", "model"):
-        _check_options(group, settings.get(group) or {})
-    return settings  # type: ignore[return-value]
-
-
-def _check_options(group: str, options: Settings) -> None:
-    for key, value in options.items():
-        if isinstance(value, dict):
-            _check_options(f"{group}.{key}", value)
-            continue
-        if key in CHOICES and value not in CHOICES[key]:
-            raise InputError(f"{group}.{key}={value}: choose one of {', '.join(CHOICES[key])}")
-        if key in COUNTS and not (isinstance(value, int) and value > 0):
-            raise InputError(f"{group}.{key}={value}: must be a whole number above 0")
-        if key in NUMBERS and not (isinstance(value, int | float) and value > 0):
-            raise InputError(f"{group}.{key}={value}: must be a number above 0")
-        if key == "kernel_size" and value % 2 == 0:
-            raise InputError(
-                f"{group}.{key}={value}: must be odd, so that a kernel has a middle; the paper uses 3"
-            )
 
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
@@ -100,7 +52,7 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
 def build_module(settings: Settings, datamodule: OdometryDataModule) -> OdometryModule:
     """An untrained module for these data, its weights drawn from the seed."""
     data = settings["data"]
-    truths = [flatten(change_frame(s.poses, s.camera_from_laser)) for s in datamodule.sequences["val"]]
+    truths = [flatten(sequence.camera_poses) for sequence in datamodule.sequences["val"]]
     lengths = list(fitting_lengths(truths, data["lengths"]))
     if lengths != data["lengths"]:
         log.info("validation is too short for data.lengths: its drift is measured over %s m", lengths)
@@ -144,6 +96,10 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     """
     options = dict(settings["trainer"])
     options["precision"] = resolve_precision(options["precision"], options["accelerator"])
+    if options["precision"].startswith("16"):
+        raise InputError("trainer.precision=16-mixed: fp16 is not supported; use bf16-mixed or 32-true")
+    if options["devices"] != 1:
+        raise InputError(f"trainer.devices={options['devices']}: one device is supported, trainer.devices=1")
     keep_freed_memory()
     try:
         return L.Trainer(
@@ -154,7 +110,8 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
         )
     except (MisconfigurationException, ValueError, TypeError) as error:
         reason = " ".join(str(error).split()).split(". ")[0]
-        raise InputError(f"trainer: {reason}; trainer.accelerator=cpu runs everywhere") from error
+        advice = "trainer.accelerator=cpu with trainer.precision=auto runs everywhere"
+        raise InputError(f"trainer: {reason}; {advice}") from error
 
 
 def _training_options(settings: Settings, run: Path) -> Settings:
@@ -182,13 +139,15 @@ def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.
     """
     run = Path(settings["run_dir"])
     last = run / LAST
+    metrics: Report = {"fingerprint": fingerprint(settings, datamodule), "seed": settings["seed"]}
     module = build_module(settings, datamodule)
+    if isinstance(module, RecurrentModule):
+        path, cnn = first_stage(settings, datamodule)
+        module.load_first_stage(cnn)
+        metrics["first_stage"] = str(path)
     if last.exists():
         log.info("going on from %s", last)
-    elif isinstance(module, RecurrentModule):
-        module.load_first_stage(first_stage(settings, datamodule))
     trainer.fit(module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True)
-    metrics = {"fingerprint": fingerprint(settings, datamodule), "seed": settings["seed"]}
     metrics |= finish_run(settings, datamodule, trainer, run)
     log_hyperparameters(trainer, settings, metrics)
     write_json(run / METRICS, metrics)
@@ -217,8 +176,8 @@ def estimate_test(module: OdometryModule, datamodule: OdometryDataModule, traine
     return {s.name: module.estimates[number] for number, s in enumerate(datamodule.sequences["test"])}
 
 
-def first_stage(settings: Settings, datamodule: OdometryDataModule) -> CNNClassification:
-    """The CNN that a recurrent variant starts from: given, found among the runs, or trained now.
+def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Path, CNNClassification]:
+    """Checkpoint and CNN that a recurrent variant starts from: given, found among the runs, or trained now.
 
     One that is found has the same recordings, network, recipe and seed.
 
@@ -247,4 +206,4 @@ def first_stage(settings: Settings, datamodule: OdometryDataModule) -> CNNClassi
                 "set it as in that training, or leave model.pretrained out"
             )
     assert isinstance(cnn, CNNClassification)
-    return cnn
+    return path, cnn

@@ -17,7 +17,7 @@ from rcnn_odom.errors import InputError
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-_failed: list[InputError] = []
+_failed: list[Exception] = []
 
 
 def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
@@ -28,7 +28,7 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     cfg.run_dir = HydraConfig.get().runtime.output_dir
     try:
         return job(cfg)
-    except InputError as error:
+    except (InputError, OSError) as error:
         log.error("error: %s", error)
         _failed.append(error)
         return None
@@ -45,6 +45,7 @@ def run_command(main: Callable[[], object]) -> int:
     except (HydraException, OmegaConfBaseException, OSError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.
         message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
-        print("error:", " ".join(message.split()), file=sys.stderr)
+        hint = "; choose another outputs= or run_dir=" if isinstance(error, OSError) else ""
+        print(f"error: {' '.join(message.split())}{hint}", file=sys.stderr)
         return 1
     return 1 if _failed else 0

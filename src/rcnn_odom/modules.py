@@ -1,6 +1,5 @@
 """The four variants of the paper as LightningModules."""
 
-from collections.abc import Mapping
 from typing import Any, ClassVar
 
 import lightning as L
@@ -11,15 +10,15 @@ from torchmetrics import MeanMetric
 
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.datamodule import Batch
+from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import camera_trajectory, frame_errors
 from rcnn_odom.losses import Loss, classification_loss, regression_loss
 from rcnn_odom.metrics.module import DriftMetric
-from rcnn_odom.motion import FloatArray, change_frame
+from rcnn_odom.motion import FloatArray
 from rcnn_odom.networks import CNN, RCNN, RotationClasses
 from rcnn_odom.scan import Sensor
+from rcnn_odom.settings import Settings
 
-Settings = Mapping[str, Any]
-"""Plain numbers, strings and lists: what a checkpoint may hold under ``weights_only``."""
 EVALUATION_CHUNK = 64
 """Pairs that go through the convolutions together when a whole drive is estimated."""
 
@@ -136,11 +135,20 @@ class OdometryModule(L.LightningModule):
         self.drift = DriftMetric(names, lengths=self.scoring["lengths"], planar=True).to(self.device)
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Scores one whole sequence."""
+        """Scores one whole sequence.
+
+        Raises:
+            InputError: training has diverged.
+        """
         sequence = self._validation()[batch["number"]]
         motions = self.estimate(batch["scans"])
-        truth = change_frame(sequence.poses, sequence.camera_from_laser)
-        self.drift.update(truth, camera_trajectory(sequence, motions, self.scoring["apply"]), sequence.name)
+        if not np.isfinite(motions).all():
+            raise InputError(
+                f"training diverged in epoch {self.current_epoch + 1}: {sequence.name} is estimated as nan "
+                "or inf; set model.learning_rate lower"
+            )
+        estimate = camera_trajectory(sequence, motions, self.scoring["apply"])
+        self.drift.update(sequence.camera_poses, estimate, sequence.name)
         errors = frame_errors(motions, sequence.motions)
         frames = len(motions)
         self.log("val/distance_mae_m", errors["distance_mae_m"], batch_size=frames)

@@ -8,6 +8,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from rcnn_odom.errors import InputError
+
 CHANNELS = (32, 32, 64, 64, 128, 128)
 STRIDES = (1, 2, 1, 2, 1, 2)
 
@@ -57,6 +59,10 @@ class Encoder(nn.Module):
         bins: length of a depth vector.
         kernel_size: odd; the paper chose 3 and tried 5 and 7.
         pooling: ``avg`` (the paper's choice) or ``max``.
+
+    Raises:
+        InputError: there are too few bins for six layers.
+        ValueError: the kernel has no middle.
     """
 
     def __init__(self, bins: int, kernel_size: int = 3, pooling: Literal["avg", "max"] = "avg") -> None:
@@ -77,6 +83,8 @@ class Encoder(nn.Module):
             nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
             layers += [convolution, nn.ReLU(inplace=True)]
             length, inputs = (length - 1) // stride + 1, channels
+        if length < 1:
+            raise InputError(f"data.sensor has {bins} bins, too few for the network; six layers leave none")
         self.layers = nn.Sequential(*layers)
         self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
         self.features = inputs * length

@@ -14,7 +14,7 @@ from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, 
 from rcnn_odom.figures import motion_figure, trajectory_figure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
-from rcnn_odom.runs import Settings, flat
+from rcnn_odom.settings import Settings, flat
 from rcnn_odom.trajectory import write_kitti, write_tum
 
 log = logging.getLogger(__name__)
@@ -81,7 +81,7 @@ def write_sequence(
     logger: TensorBoardLogger | None,
 ) -> None:
     """One sequence's trajectory in KITTI and TUM format and the paper's two figures of it."""
-    name = re.sub(r"[^\w.-]+", "_", sequence.name).strip("_")
+    name = re.sub(r"[^\w.-]+", "_", sequence.name.replace(":", "-")).strip("_")
     for kind in ("trajectories", "figures"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     poses = camera_trajectory(sequence, motions, data["apply"])

@@ -11,11 +11,12 @@ import yaml
 
 from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
+from rcnn_odom.settings import Settings
 
 log = logging.getLogger(__name__)
 
-Settings = dict[str, Any]
-"""A resolved configuration: plain numbers, strings, lists and dictionaries."""
+RECIPE_VERSION = 1
+"""Raised whenever the same settings train another network, so that an older first stage is not taken."""
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
@@ -30,13 +31,13 @@ def start_run(run: Path, settings: Settings) -> None:
     config = run / CONFIG
     if (run / METRICS).exists():
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
-    if config.exists() and yaml.safe_load(config.read_text()) != settings:
+    if config.exists() and read_settings(run) != settings:
         raise InputError(
             f"{config}: the run was begun with other settings; repeat them, or choose another run_dir"
         )
     try:
         run.mkdir(parents=True, exist_ok=True)
-        config.write_text(yaml.safe_dump(settings, sort_keys=False))
+        _write(config, yaml.safe_dump(settings, sort_keys=False))
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
     log.info("run %s, seed %d", run, settings["seed"])
@@ -46,40 +47,40 @@ def point_latest(outputs: Path, run: Path) -> None:
     """Lets ``latest`` among the runs point to this one."""
     link = outputs / f".latest.{os.getpid()}"
     link.symlink_to(os.path.relpath(run, outputs))
-    link.replace(outputs / "latest")
+    try:
+        link.replace(outputs / "latest")
+    finally:
+        link.unlink(missing_ok=True)
 
 
 def read_settings(run: Path) -> Settings:
     """The configuration that a run was started with.
 
     Raises:
-        InputError: there is no run.
+        InputError: there is no run, or its configuration cannot be read.
     """
     try:
-        return yaml.safe_load((run / CONFIG).read_text())
+        settings = yaml.safe_load((run / CONFIG).read_text())
     except OSError as error:
-        raise InputError(
-            f"{run / CONFIG}: {error.strerror}; name the folder of a run, run=outputs/..."
-        ) from error
-
-
-def flat(settings: Settings, prefix: str = "") -> Settings:
-    """The settings under names as on the command line, ``model.kernel_size`` and so on."""
-    pairs: Settings = {}
-    for key, value in settings.items():
-        pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
-    return pairs
+        raise InputError(f"{run / CONFIG}: {error.strerror}; name a run's folder, run=outputs/...") from error
+    except (yaml.YAMLError, UnicodeDecodeError):
+        settings = None
+    if not isinstance(settings, dict) or not {"data", "model", "trainer"} <= settings.keys():
+        raise InputError(f"{run / CONFIG}: not the configuration of a run; name another, run=outputs/...")
+    return settings
 
 
 def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
     """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
-    recordings = [
-        (sequence.key, sequence.name, hashlib.sha256(sequence.poses.tobytes()).hexdigest())
+    recordings = {
+        split: [
+            (sequence.key, sequence.name, hashlib.sha256(sequence.poses.tobytes()).hexdigest())
+            for sequence in datamodule.sequences[split]
+        ]
         for split in ("train", "val")
-        for sequence in datamodule.sequences[split]
-    ]
+    }
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
-    parts = [recordings, data, settings["model"], settings["trainer"], settings["seed"]]
+    parts = [RECIPE_VERSION, recordings, data, settings["model"], settings["trainer"], settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -90,14 +91,18 @@ def find_run(outputs: Path, wanted: str) -> Path | None:
         try:
             if json.loads(metrics.read_text())["fingerprint"] == wanted and (metrics.parent / BEST).exists():
                 found.append(metrics)
-        except (ValueError, KeyError, OSError):
+        except (ValueError, KeyError, TypeError, OSError):
             continue  # not a finished run of ours
     newest = max(found, key=lambda path: path.stat().st_mtime, default=None)
     return newest.parent / BEST if newest else None
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a file at once or not at all."""
+    """Writes a JSON file at once or not at all."""
+    _write(path, json.dumps(content, indent=2) + "\n")
+
+
+def _write(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(json.dumps(content, indent=2) + "\n")
+    partial.write_text(text)
     partial.replace(path)

@@ -23,7 +23,7 @@ def read_kitti(path: str | Path) -> FloatArray:
 
     Raises:
         InputError: the file cannot be read or is empty, or a line (which is named) does not hold
-            12 finite numbers.
+            12 finite numbers with a rotation among them.
     """
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
@@ -47,7 +47,10 @@ def _parse_row(line: str, where: str) -> FloatArray:
         raise InputError(f"{where}: not a KITTI pose of 12 numbers: {error}") from error
     if not np.isfinite(row).all():
         raise InputError(f"{where}: a pose must be finite, found nan or inf")
-    return row.reshape(3, 4)
+    pose = row.reshape(3, 4)
+    if abs(np.linalg.det(pose[:, :3]) - 1) > 0.01:
+        raise InputError(f"{where}: the 3x3 part of a pose must be a rotation, and this one is not")
+    return pose
 
 
 def write_kitti(path: str | Path, poses: npt.ArrayLike) -> None:

@@ -14,14 +14,17 @@ import numpy.typing as npt
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame
+from rcnn_odom.trajectory import read_kitti
 
-READER_VERSION = 1
+READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
 
 POINT_BYTES = 16
 SAMPLED_FRAMES = 20
 RING_DROP = np.deg2rad(30.0)
 """The azimuth drops by more than this between rings; within one, close objects make it drop by up to 7."""
+
+HALF_RING_SPACING = np.deg2rad(0.2)
 
 LEVEL = np.deg2rad(0.15)
 """Elevation that the chosen ring is to be nearest to: a hair above horizontal. KITTI's two most level rings
@@ -55,22 +58,24 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
     _need_folder(folder / "velodyne", "unpack the odometry data set's velodyne laser data there")
     scans, fingerprint_of_files = _list_scans(folder / "velodyne")
     camera_from_laser = read_calibration(folder / "calib.txt")
-    stamps = _read_table(folder / "times.txt", 1, "the time stamps of every scan")[:, 0]
-    camera_poses = read_poses(root / "poses" / f"{name}.txt")
+    stamps = _read_stamps(folder / "times.txt")
+    camera_poses = _read_poses(root / "poses" / f"{name}.txt")
     _need_same_number(folder, len(scans), len(stamps), len(camera_poses))
+    elevations = _ring_elevations(scans)
     if ring is None:
-        ring, elevation = _most_level_ring(scans)
-        chosen = f"ring {ring} of the Velodyne, median elevation {elevation:+.2f} degrees"
-    elif ring < 0:
-        raise InputError(f"data.ring must be 0 or more, not {ring}; leave it out for the most level ring")
-    else:
-        chosen = f"ring {ring} of the Velodyne, as asked for"
+        ring = int(np.argmin(np.abs(elevations - LEVEL)))
+    elif not 0 <= ring < len(elevations):
+        raise InputError(
+            f"data.ring must be 0 to {len(elevations) - 1}, not {ring}; or null, the most level one"
+        )
+    elevation = float(elevations[ring])
+    chosen = f"ring {ring} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"
     key = f"kitti {READER_VERSION} {ring} {fingerprint_of_files}"
     return Sequence(
         name=name,
         poses=change_frame(camera_poses, np.linalg.inv(camera_from_laser)),
         stamps=stamps,
-        read_scan=RingReader(tuple(map(str, scans)), ring),
+        read_scan=RingReader(tuple(map(str, scans)), ring, elevation),
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
         camera_from_laser=camera_from_laser,
         notes=(f"{len(scans)} scans", chosen),
@@ -79,10 +84,15 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
 
 @dataclass(frozen=True)
 class RingReader:
-    """Frame index -> angles in radians and horizontal ranges in metres of one ring, both (P,)."""
+    """Frame index -> angles in radians and horizontal ranges in metres of one ring, both (P,).
+
+    A frame in which an earlier ring was split or lost has its rings elsewhere in the file: where the
+    ring's elevation (radians) is far from the sequence's, the neighbour that has it is taken.
+    """
 
     paths: tuple[str, ...]
     ring: int
+    elevation: float
 
     def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
         """Read one frame.
@@ -98,8 +108,16 @@ class RingReader:
                 f"{path}: frame {frame} has {len(starts)} rings, so no ring {self.ring} (they count "
                 "from 0); choose a smaller data.ring, or download the file again"
             )
-        x, y, _ = _split_rings(points, starts)[self.ring].T.astype(np.float64)
+        x, y, _ = self._find_ring(_split_rings(points, starts)).T.astype(np.float64)
         return np.arctan2(y, x), np.hypot(x, y)
+
+    def _find_ring(self, rings: list[Points]) -> Points:
+        def distance(ring: Points) -> float:
+            return abs(_median_elevation(ring) - self.elevation)
+
+        if distance(rings[self.ring]) < HALF_RING_SPACING:
+            return rings[self.ring]
+        return min(rings[max(self.ring - 1, 0) : self.ring + 2], key=distance)
 
 
 def ring_starts(points: Points) -> npt.NDArray[np.int64]:
@@ -144,19 +162,6 @@ def read_calibration(path: str | Path) -> FloatArray:
     raise InputError(f"{path}: no line starts with 'Tr:' (laser to camera); use the odometry data's own")
 
 
-def read_poses(path: str | Path) -> FloatArray:
-    """Poses of a KITTI trajectory file, in the frame that the file has, (N, 4, 4).
-
-    Raises:
-        InputError: there is no such file, or a line is not 12 finite numbers.
-    """
-    path = Path(path)
-    rows = _read_table(path, 12, "the ground truth (KITTI gives none for sequences 11 to 21)")
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3] = rows.reshape(-1, 3, 4)
-    return poses
-
-
 def _azimuth(x: Points, y: Points, at: npt.NDArray[np.int64]) -> FloatArray:
     return np.arctan2(y[at], x[at], dtype=np.float64) % (2 * np.pi)
 
@@ -167,8 +172,8 @@ def _split_rings(points: Points, starts: npt.NDArray[np.int64]) -> list[Points]:
     return [points[start:end, :3] for start, end in zip(starts, ends, strict=True)]
 
 
-def _most_level_ring(scans: list[Path]) -> tuple[int, float]:
-    """Index and median elevation in degrees of the ring nearest to horizontal over sampled frames."""
+def _ring_elevations(scans: list[Path]) -> FloatArray:
+    """Median elevation in radians of every ring over sampled frames."""
     frames = np.unique(np.linspace(0, len(scans) - 1, SAMPLED_FRAMES).round().astype(int))
     elevations = []
     for frame in frames:
@@ -176,10 +181,8 @@ def _most_level_ring(scans: list[Path]) -> tuple[int, float]:
         rings = _split_rings(points, ring_starts(points))
         elevations.append([_median_elevation(ring) for ring in rings])
     shared = min(map(len, elevations))
-    # In single frames a neighbour can be nearer: the median over frames settles on one.
-    median = np.median([of_frame[:shared] for of_frame in elevations], axis=0)
-    ring = int(np.argmin(np.abs(median - LEVEL)))
-    return ring, float(np.rad2deg(median[ring]))
+    # In single frames a neighbour can be nearer to horizontal: the median over frames settles on one.
+    return np.median([of_frame[:shared] for of_frame in elevations], axis=0)
 
 
 def _median_elevation(points: Points) -> float:
@@ -245,10 +248,15 @@ def _read_lines(path: Path, what: str) -> list[str]:
         raise InputError(f"{path}: cannot be read ({error.strerror})") from error
 
 
-def _read_table(path: Path, columns: int, what: str) -> FloatArray:
-    lines = _read_lines(path, what)
-    rows = [_numbers(path, number, line, columns) for number, line in enumerate(lines, start=1)]
-    return np.array(rows, dtype=np.float64).reshape(-1, columns)
+def _read_poses(path: Path) -> FloatArray:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; the ground truth is needed (KITTI has none for 11 to 21)")
+    return read_kitti(path)
+
+
+def _read_stamps(path: Path) -> FloatArray:
+    lines = _read_lines(path, "the time stamps of every scan")
+    return np.array([_numbers(path, number, line, 1) for number, line in enumerate(lines, start=1)])[:, 0]
 
 
 def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:

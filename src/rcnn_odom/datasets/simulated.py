@@ -59,7 +59,7 @@ def load(name: str, *, seed: int = 0, frames: int = 600) -> Sequence:
         )
     if seed < 0:
         raise InputError(
-            f"simulated sequence {name}: a seed is 0 or more, not {seed}; change the data set's seed"
+            f"simulated sequence {name}: a seed is 0 or more, not {seed}; change data.world_seed"
         )
     city = build_city(_generator(seed, name, _CITY))
     planar = _drive(city, frames, seed, name)
