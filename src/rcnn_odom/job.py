@@ -5,6 +5,7 @@ import os
 import re
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 from hydra.core.hydra_config import HydraConfig
@@ -25,7 +26,8 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
 
     The mistake is remembered for :func:`run_command` and not raised: the other jobs of a sweep go on.
     """
-    cfg.run_dir = HydraConfig.get().runtime.output_dir
+    folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
+    cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     try:
         return job(cfg)
     except (InputError, OSError) as error:
