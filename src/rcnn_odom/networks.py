@@ -245,6 +245,10 @@ class RCNN(nn.Module):
         super().__init__()
         self.cnn = cnn
         self.lstm = LSTM(cnn.encoder.features + 2, hidden, layers)
+        # Drawn as if the two estimates were all the input: as two among thousands of features they would
+        # hardly be heard, and the LSTM would have to find out again what the first stage knows.
+        with torch.no_grad():
+            self.lstm.weight_ih[0][:, -2:].uniform_(-(2**-0.5), 2**-0.5)
         self.head = MotionHead(hidden, classes, angle)
 
     def forward(self, pairs: Tensor, state: State | None = None) -> tuple[Estimate, State]:
