@@ -191,7 +191,9 @@ def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Pat
         cnn_settings = {**settings, "model": model["first_stage"], "run_dir": str(run)}
         cnn_data = build_datamodule(cnn_settings)
         cnn_data.sequences = datamodule.sequences
-        path = find_run(Path(settings["outputs"]), fingerprint(cnn_settings, cnn_data))
+        wanted = fingerprint(cnn_settings, cnn_data)
+        # The run's own, from before it was stopped, may lie elsewhere than in outputs.
+        path = find_run(Path(settings["outputs"]), wanted) or find_run(run, wanted)
         if path is None:
             log.info("first stage: no fitting cnn_cls in %s, training one", settings["outputs"])
             start_run(run, cnn_settings)
