@@ -17,6 +17,7 @@ def evaluate(cfg: DictConfig) -> dict:
     Raises:
         InputError: see its message.
     """
+    import os
     from pathlib import Path
 
     from rcnn_odom import experiment, runs
@@ -33,7 +34,12 @@ def evaluate(cfg: DictConfig) -> dict:
     module = load_module(run / runs.BEST, sensor=Sensor(**settings["data"]["sensor"]))
     datamodule = experiment.build_datamodule(settings).load(("test",))
     motions = experiment.estimate_test(module, datamodule, trainer)
-    metrics = {"run": str(run), "variant": module.variant, "data": settings["data"]["name"]}
+    runs.write_config(folder, settings)
+    metrics = {
+        "run": os.path.relpath(run.resolve()),
+        "variant": module.variant,
+        "data": settings["data"]["name"],
+    }
     metrics |= report_test(module, motions, datamodule.sequences["test"], settings["data"], folder)
     runs.write_json(folder / runs.METRICS, metrics)
     log.info("all of it is in %s", folder)

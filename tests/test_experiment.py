@@ -45,6 +45,9 @@ def test_a_run_leaves_everything_behind(configure, kitti, tmp_path, variant):
     for kind in ("trajectory", "motion"):
         assert (run / "figures" / f"05_{kind}.png").stat().st_size > 10_000
     assert len(np.loadtxt(run / "trajectories" / "05.txt")) == 60
+    root = kitti[0].split("=")[1]
+    truth = np.loadtxt(run / "trajectories" / "05_truth.txt")
+    np.testing.assert_allclose(truth, np.loadtxt(f"{root}/poses/05.txt"), atol=1e-9)
     assert np.loadtxt(run / "trajectories" / "05.tum").shape == (60, 8)
     assert set(metrics["baselines"]) == {"mean_motion", "held_motion"}
     assert metrics["test"]["sequences"]["05"]["drift"]["segments"] > 0
@@ -133,6 +136,7 @@ def test_evaluating_again_gives_the_same_numbers(configure, kitti, tmp_path):
     assert again["test"] == trained["test"]
     assert again["baselines"] == trained["baselines"]
     assert (tmp_path / "outputs" / "evaluation" / "metrics.json").exists()
+    assert (tmp_path / "outputs" / "evaluation" / "config.yaml").exists()
 
 
 def test_evaluating_on_other_data(configure, kitti, tmp_path):
@@ -210,8 +214,13 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
     ("option", "message"),
     [
         ("trainer.accelerator=gpu", "accelerator=cpu"),
-        ("trainer.precision=16-mixed", "use bf16-mixed"),
-        ("trainer.precision=good", "precision=auto"),
+        ("trainer.precision=16-mixed", "choose one of auto, bf16-mixed, 32-true"),
+        ("trainer.precision=32", "choose one of auto, bf16-mixed, 32-true"),
+        ("trainer.gradient_clip_val=0", "must be null, which clips nothing"),
+        ("trainer.accelerator=abacus", "accelerator=cpu"),
+        ("data.lengths=100", "must list lengths"),
+        ("data.ring=abc", "must be null or a whole number"),
+        ("data.ring=9", "data.ring must be 0 to 3"),
         ("trainer.devices=2", "one device"),
         ("data.train=00", "must list sequences"),
         ("data.val=['10','10']", "each once"),
@@ -219,7 +228,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
         ("data.augment.mirror=maybe", "must be true or false"),
         ("data.augment.max_turn_deg=abc", "must be 0 or a positive number"),
         ("data.workers=-1", "must be null or a whole number"),
-        ("data.ring=-1", "data.ring must be 0 to 3"),
+        ("data.ring=-1", "not negative"),
         ("data.sensor.resolution_deg=60.0", "too few for the network"),
         ("seed=-1", "not negative"),
         ("model.epochs=true", "whole number above 0"),
@@ -255,7 +264,7 @@ def test_bad_input_leaves_latest_where_it_was(configure, kitti, tmp_path):
 
 def test_parts_of_one_drive_have_files_of_their_own(configure, kitti, tmp_path):
     train(configure("model=cnn_reg", *kitti, "data.test=['05[:0.5]','05[0.5:]']"))
-    assert len(list((tmp_path / "outputs" / "run" / "trajectories").glob("05*.txt"))) == 2
+    assert len(list((tmp_path / "outputs" / "run" / "trajectories").glob("05*.tum"))) == 2
 
 
 def test_moving_a_drive_from_training_to_validation_asks_for_another_first_stage(configure, kitti, tmp_path):
@@ -320,7 +329,7 @@ def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, argum
 def test_help_prints_the_options():
     command = [sys.executable, str(ROOT / "train.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert "data: _common, carmen, kitti, simulated" in done.stdout
+    assert "data: carmen, kitti, simulated" in done.stdout
     assert "kernel_size: 3" in done.stdout
 
 

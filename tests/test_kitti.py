@@ -230,6 +230,17 @@ def test_frame_without_the_ring(root: Path) -> None:
         sequence.read_scan(1)
 
 
+def test_points_that_are_not_finite_are_missing_returns(root: Path) -> None:
+    sequence = kitti.load("00", root=root)
+    angles, _ = sequence.read_scan(1)
+    points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
+    points[kitti.ring_starts(points)[LEVEL_RING] + 5] = np.nan
+    points.tofile(scan_file(root, 1))
+    again = kitti.load("00", root=root)
+    assert again.notes == sequence.notes
+    np.testing.assert_array_equal(again.read_scan(1)[0], np.delete(angles, 5))
+
+
 def test_frame_with_a_ring_too_many_gives_the_same_laser(root: Path) -> None:
     sequence = kitti.load("00", root=root)
     expected = sequence.read_scan(1)

@@ -126,7 +126,7 @@ def _is_whole(path: Path, shape: tuple[int, int]) -> bool:
         return np.load(path, mmap_mode="r").shape == shape
     except FileNotFoundError:
         return False
-    except ValueError:
+    except (ValueError, EOFError):
         log.warning("%s: damaged, encoding it again", path)
         return False
 

@@ -173,7 +173,7 @@ class OdometryDataModule(L.LightningDataModule):
         """Reads and encodes the sequences of these splits.
 
         Raises:
-            InputError: a split is empty; a recording is missing, damaged or too short.
+            InputError: a split is empty; a recording is missing or damaged.
         """
         for split in splits:
             if not self.names[split]:
@@ -189,12 +189,6 @@ class OdometryDataModule(L.LightningDataModule):
         )
         for split in splits:
             self.sequences[split] = [cut(encoded, name) for name in self.names[split]]
-        for sequence in self.sequences.get("train", []):
-            if len(sequence) <= self.window:
-                raise InputError(
-                    f"training sequence {sequence.name} has {len(sequence)} frames, a window needs "
-                    f"{self.window + 1}; leave it out of data.train or set model.window lower"
-                )
         return self
 
     def setup(self, stage: str | None = None) -> None:
@@ -208,8 +202,18 @@ class OdometryDataModule(L.LightningDataModule):
         return motions.mean(0), np.maximum(motions.std(0), 1e-6)
 
     def train_dataloader(self) -> DataLoader:
-        """Shuffled batches of windows: see :class:`Windows`."""
+        """Shuffled batches of windows: see :class:`Windows`.
+
+        Raises:
+            InputError: a sequence is shorter than a window.
+        """
         sequences = self.sequences["train"]
+        for sequence in sequences:
+            if len(sequence) <= self.window:
+                raise InputError(
+                    f"training sequence {sequence.name} has {len(sequence)} frames, a window needs "
+                    f"{self.window + 1}; leave it out of data.train or set model.window lower"
+                )
         sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
         batch_size = min(self.batch_size, len(sampler))
         windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)

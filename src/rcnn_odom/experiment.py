@@ -96,8 +96,6 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     """
     options = dict(settings["trainer"])
     options["precision"] = resolve_precision(options["precision"], options["accelerator"])
-    if options["precision"].startswith("16"):
-        raise InputError("trainer.precision=16-mixed: fp16 is not supported; use bf16-mixed or 32-true")
     if options["devices"] != 1:
         raise InputError(f"trainer.devices={options['devices']}: one device is supported, trainer.devices=1")
     keep_freed_memory()
@@ -165,7 +163,7 @@ def finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Tr
     return {
         "variant": module.variant,
         "data": settings["data"]["name"],
-        "val": {"drift": float(best), "lengths": module.scoring["lengths"]},
+        "val": {"drift": None if best is None else float(best), "lengths": module.scoring["lengths"]},
         **report_test(module, motions, datamodule.sequences["test"], settings["data"], run, logger),
     }
 
@@ -192,8 +190,8 @@ def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Pat
         cnn_data = build_datamodule(cnn_settings)
         cnn_data.sequences = datamodule.sequences
         wanted = fingerprint(cnn_settings, cnn_data)
-        # The run's own, from before it was stopped, may lie elsewhere than in outputs.
-        path = find_run(Path(settings["outputs"]), wanted) or find_run(run, wanted)
+        # The run's own comes first: it is there when the run was stopped after it.
+        path = find_run(run, wanted) or find_run(Path(settings["outputs"]), wanted)
         if path is None:
             log.info("first stage: no fitting cnn_cls in %s, training one", settings["outputs"])
             start_run(run, cnn_settings)

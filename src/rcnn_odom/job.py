@@ -24,12 +24,17 @@ _failed: list[Exception] = []
 def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
     """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
 
+    Raises:
+        KeyboardInterrupt: stopped, which also stops a sweep.
+
     The mistake is remembered for :func:`run_command` and not raised: the other jobs of a sweep go on.
     """
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
     cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     try:
         return job(cfg)
+    except SystemExit:  # how Lightning ends after Ctrl-C
+        raise KeyboardInterrupt from None
     except (InputError, OSError) as error:
         log.error("error: %s", error)
         _failed.append(error)

@@ -80,12 +80,13 @@ def write_sequence(
     folder: Path,
     logger: TensorBoardLogger | None,
 ) -> None:
-    """One sequence's trajectory in KITTI and TUM format and the paper's two figures of it."""
+    """One sequence's trajectory in KITTI and TUM format, its truth, and the paper's two figures of it."""
     name = re.sub(r"[^\w.-]+", "_", sequence.name.replace(":", "-")).strip("_")
     for kind in ("trajectories", "figures"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
     poses = camera_trajectory(sequence, motions, data["apply"])
     write_kitti(folder / "trajectories" / f"{name}.txt", poses)
+    write_kitti(folder / "trajectories" / f"{name}_truth.txt", sequence.camera_poses)
     write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, poses)
     figures = {
         "trajectory": trajectory_figure(title, sequence.poses, compose(motions, data["apply"])),

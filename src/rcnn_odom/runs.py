@@ -36,17 +36,22 @@ def start_run(run: Path, settings: Settings) -> None:
             f"{config}: the run was begun with other settings; repeat them, or choose another run_dir"
         )
     try:
-        run.mkdir(parents=True, exist_ok=True)
-        _write(config, yaml.safe_dump(settings, sort_keys=False))
+        write_config(run, settings)
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
     log.info("run %s, seed %d", run, settings["seed"])
 
 
+def write_config(folder: Path, settings: Settings) -> None:
+    """The settings into a folder, at once or not at all."""
+    folder.mkdir(parents=True, exist_ok=True)
+    _write(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
+
+
 def point_latest(outputs: Path, run: Path) -> None:
     """Lets ``latest`` among the runs point to this one."""
     link = outputs / f".latest.{os.getpid()}"
-    link.symlink_to(os.path.relpath(run, outputs))
+    link.symlink_to(os.path.relpath(run.resolve(), outputs.resolve()))
     try:
         link.replace(outputs / "latest")
     finally:

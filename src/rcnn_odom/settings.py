@@ -27,6 +27,10 @@ def _is_count(value: Any) -> bool:
     return type(value) is int and value > 0
 
 
+def _is_index(value: Any) -> bool:
+    return type(value) is int and 0 <= value < 2**32
+
+
 COUNT: Rule = (_is_count, "must be a whole number above 0")
 POSITIVE: Rule = (lambda value: _is_number(value) and value > 0, "must be a number above 0")
 FLAG: Rule = (lambda value: type(value) is bool, "must be true or false")
@@ -35,19 +39,33 @@ NAMES: Rule = (
     "must list sequences, each once, for instance [a,b]",
 )
 
+PATHS = ("root", "reference", "pretrained", "run", "run_dir", "outputs")
+"""Options that may look like a number on the command line, ``data.root=2011``, and are a path."""
+
 RULES: dict[str, Rule] = {
     "pooling": _one_of("avg", "max"),
     "angle": _one_of("expectation", "argmax"),
     "apply": _one_of("start", "middle", "end"),
     "kernel_size": (lambda value: _is_count(value) and value % 2 == 1, "must be odd; the paper uses 3"),
-    **dict.fromkeys(("count", "hidden_size", "layers", "epochs", "window", "batch_size"), COUNT),
+    **dict.fromkeys(("count", "hidden_size", "layers", "epochs", "window", "batch_size", "frames"), COUNT),
     **dict.fromkeys(("beta", "learning_rate", "width_deg", "regression", "classification"), POSITIVE),
     **dict.fromkeys(("resolution_deg", "field_of_view_deg", "max_range"), POSITIVE),
     **dict.fromkeys(("freeze", "mirror", "per_sample_norm"), FLAG),
     **dict.fromkeys(("train", "val", "test"), NAMES),
+    "lengths": (
+        lambda value: isinstance(value, list) and bool(value) and all(map(POSITIVE[0], value)),
+        "must list lengths in metres, for instance [1,2,5]",
+    ),
+    "precision": _one_of("auto", "bf16-mixed", "32-true"),
+    "gradient_clip_val": (
+        lambda value: value is None or POSITIVE[0](value),
+        "must be null, which clips nothing, or a number above 0",
+    ),
+    "gradient_clip_algorithm": _one_of("norm"),
+    **dict.fromkeys(("world_seed", "seed"), (_is_index, "must be a whole number, not negative")),
+    "ring": (lambda value: value is None or _is_index(value), "must be null or a whole number, not negative"),
     "max_turn_deg": (lambda value: _is_number(value) and value >= 0, "must be 0 or a positive number"),
     "workers": (lambda value: value is None or _is_count(value), "must be null or a whole number above 0"),
-    "seed": (lambda value: type(value) is int and 0 <= value < 2**32, "must be a whole number, not negative"),
 }
 """What the last part of an option's name asks of its value."""
 
@@ -69,11 +87,20 @@ def plain(cfg: DictConfig) -> Settings:
     for split in data.keys() & {"train", "val", "test"}:
         if isinstance(data[split], list):  # where [10] is a number to Hydra, and [00] is not
             data[split] = [str(name) for name in data[split]]
+    _name_paths(settings)
     for name, value in flat(settings).items():
         is_valid, wanted = RULES.get(name.split(".")[-1], (bool, ""))
         if wanted and not is_valid(value):
             raise InputError(f"{name}={value}: {wanted}")
     return settings
+
+
+def _name_paths(settings: Settings) -> None:
+    for key, value in settings.items():
+        if isinstance(value, dict):
+            _name_paths(value)
+        elif key in PATHS and value is not None:
+            settings[key] = str(value)
 
 
 def flat(settings: Settings, prefix: str = "") -> Settings:

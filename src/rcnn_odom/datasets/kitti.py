@@ -180,9 +180,9 @@ def _ring_elevations(scans: list[Path]) -> FloatArray:
         points = _read_points(scans[frame])
         rings = _split_rings(points, ring_starts(points))
         elevations.append([_median_elevation(ring) for ring in rings])
-    shared = min(map(len, elevations))
+    usual = int(np.median([len(of_frame) for of_frame in elevations]))
     # In single frames a neighbour can be nearer to horizontal: the median over frames settles on one.
-    return np.median([of_frame[:shared] for of_frame in elevations], axis=0)
+    return np.median([of_frame[:usual] for of_frame in elevations if len(of_frame) >= usual], axis=0)
 
 
 def _median_elevation(points: Points) -> float:
@@ -197,7 +197,9 @@ def _read_points(path: str | Path) -> Points:
         raise InputError(f"{path}: cannot be read ({error.strerror}); download it again") from error
     if len(values) == 0 or len(values) % 4:
         raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
-    return values.reshape(-1, 4)
+    points = values.reshape(-1, 4)
+    # A point that is not finite is how some drivers write a missing return.
+    return points[np.isfinite(points[:, :3]).all(1)]
 
 
 def _list_scans(folder: Path) -> tuple[list[Path], str]:
@@ -256,7 +258,7 @@ def _read_poses(path: Path) -> FloatArray:
 
 def _read_stamps(path: Path) -> FloatArray:
     lines = _read_lines(path, "the time stamps of every scan")
-    return np.array([_numbers(path, number, line, 1) for number, line in enumerate(lines, start=1)])[:, 0]
+    return np.array([_numbers(path, number, line, 1)[0] for number, line in enumerate(lines, start=1)])
 
 
 def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
