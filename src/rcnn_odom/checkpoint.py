@@ -22,6 +22,8 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
     """
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True)
+        if not isinstance(saved, dict):
+            raise TypeError(f"it holds a {type(saved).__name__}")
         settings, weights = saved["hyper_parameters"], saved["state_dict"]
         found = settings["variant"]
         module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
