@@ -1,6 +1,9 @@
 """Encoded scans: equal to direct encoding, read back without the reader, complete or absent."""
 
 import os
+import subprocess
+import sys
+import time
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -166,3 +169,44 @@ def test_part_is_a_view_of_the_same_frames():
     np.testing.assert_array_equal(part.wheel_odometry, whole.wheel_odometry[2:6])
     np.testing.assert_allclose(part.motions[:, 0], [0.5, 0.7, 0.9])
     assert whole.part(0, 3).name == "drive"
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="finds the processes in /proc")
+def test_workers_end_when_their_parent_is_killed(tmp_path):
+    folder, script = tmp_path / "cache", tmp_path / "encode.py"
+    script.write_text(f"""
+from pathlib import Path
+from rcnn_odom.cache import encode_sequences
+from rcnn_odom.datasets.simulated import load
+from rcnn_odom.scan import Sensor
+if __name__ == "__main__":
+    encode_sequences([load("00", frames=20_000)], Sensor(), Path({str(folder)!r}), 2)
+""")
+    parent = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
+    # Itself, two workers and Python's resource tracker; a worker that has not begun ends by itself.
+    wait_for(lambda: len(running(parent.pid)) == 4)
+    time.sleep(2)
+    parent.kill()
+    parent.wait()
+    wait_for(lambda: not running(parent.pid))
+    assert not list(folder.glob("*.npy"))
+
+
+def running(session):
+    """Processes of a session, which orphans stay in, that are not just waiting to be buried."""
+    found = []
+    for stat in Path("/proc").glob("[0-9]*/stat"):
+        try:
+            state, _, _, of_process, *_ = stat.read_text().rpartition(")")[2].split()
+        except OSError:
+            continue
+        if int(of_process) == session and state != "Z":
+            found.append(stat.parent.name)
+    return found
+
+
+def wait_for(condition, seconds=20):
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "waited in vain"
+        time.sleep(0.1)

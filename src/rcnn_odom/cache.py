@@ -4,10 +4,12 @@ import hashlib
 import json
 import logging
 import os
+import threading
+import time
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass, replace
 from functools import cached_property
-from multiprocessing import get_context
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +26,7 @@ log = logging.getLogger(__name__)
 ENCODING_VERSION = 1
 """Raised whenever ``rcnn_odom.scan.encode`` gives other numbers for the same input."""
 CHUNK = 64
+DAY = 86400.0
 
 
 @dataclass(frozen=True)
@@ -95,6 +98,9 @@ def encode_sequences(
             raise InputError(
                 f"{folder}: cannot hold encoded scans ({error.strerror}); set outputs="
             ) from error
+        for left_over in folder.glob(".*.partial"):
+            if time.time() - left_over.stat().st_mtime > DAY:
+                left_over.unlink(missing_ok=True)
         total = sum(len(sequence) for sequence in missing.values())
         log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
         # Fresh processes: a fork of one that has started torch's threads can hang.
@@ -138,6 +144,15 @@ _work: tuple[list[Sequence], Sensor]
 def _start_worker(sequences: list[Sequence], sensor: Sensor) -> None:
     global _work
     _work = sequences, sensor
+    threading.Thread(target=_end_with_parent, daemon=True).start()
+
+
+def _end_with_parent() -> None:
+    """A killed parent cannot tell its workers to end, and they would wait for it forever."""
+    parent = parent_process()
+    if parent is not None:
+        parent.join()
+        os._exit(1)
 
 
 def _encode_frames(number: int, start: int, stop: int) -> npt.NDArray[np.float32]:
