@@ -173,7 +173,7 @@ class OdometryDataModule(L.LightningDataModule):
         """Reads and encodes the sequences of these splits.
 
         Raises:
-            InputError: a split is empty; a recording is missing or damaged.
+            InputError: a split is empty; a recording is missing, damaged or shorter than a window.
         """
         for split in splits:
             if not self.names[split]:
@@ -189,7 +189,16 @@ class OdometryDataModule(L.LightningDataModule):
         )
         for split in splits:
             self.sequences[split] = [cut(encoded, name) for name in self.names[split]]
+        self._check_windows()
         return self
+
+    def _check_windows(self) -> None:
+        for sequence in self.sequences.get("train", []):
+            if len(sequence) <= self.window:
+                raise InputError(
+                    f"training sequence {sequence.name} has {len(sequence)} frames, a window needs "
+                    f"{self.window + 1}; leave it out of data.train or set model.window lower"
+                )
 
     def setup(self, stage: str | None = None) -> None:
         """Lightning's hook: the same as :meth:`load`, once."""
@@ -208,12 +217,7 @@ class OdometryDataModule(L.LightningDataModule):
             InputError: a sequence is shorter than a window.
         """
         sequences = self.sequences["train"]
-        for sequence in sequences:
-            if len(sequence) <= self.window:
-                raise InputError(
-                    f"training sequence {sequence.name} has {len(sequence)} frames, a window needs "
-                    f"{self.window + 1}; leave it out of data.train or set model.window lower"
-                )
+        self._check_windows()
         sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
         batch_size = min(self.batch_size, len(sampler))
         windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)

@@ -47,11 +47,6 @@ def load(
     pose; on ROBOTLASER1 lines, whose odometry is the robot's, it is moved to the laser by the offset
     between robot and laser on the first line, since they are bolted together.
 
-    Beams run counter-clockwise from the right. FLASER lines do not say at which angles, so an even
-    number n leaves the field of view open at its left end (SICK's 180 of 181 beams, spacing
-    field of view / n) and an odd one closes it (field of view / (n - 1)). ROBOTLASER1 lines say it, and
-    their readings at or beyond the line's own maximum range come as infinite: no return.
-
     Args:
         name: the log's file name, with or without .log or .clf and .gz or .bz2.
         root: the folder of the log.
@@ -105,6 +100,11 @@ class LaserLine(NamedTuple):
 @dataclass(frozen=True, eq=False)
 class Beams:
     """Frame index -> angles in radians and ranges in metres, both (P,), from memory.
+
+    Beams run counter-clockwise from the right. FLASER lines do not say at which angles, so an even
+    number n leaves the field of view open at its left end (SICK's 180 of 181 beams, spacing
+    field of view / n) and an odd one closes it (field of view / (n - 1)). ROBOTLASER1 lines say it, and
+    their readings at or beyond the line's own maximum range come as infinite: no return.
 
     All readings lie in one array, (sum of P,), because the number of beams may change within a log;
     those of a frame begin at its offset (N+1,).
