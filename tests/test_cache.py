@@ -1,6 +1,7 @@
 """Encoded scans: equal to direct encoding, read back without the reader, complete or absent."""
 
 import os
+import resource
 import subprocess
 import sys
 import time
@@ -129,7 +130,7 @@ def test_stopped_encoding_leaves_nothing(tmp_path, calls):
     cache = tmp_path / "cache"
     with pytest.raises(InputError, match="frame 140: damaged"):
         encode_sequences([make_sequence(calls, broken=140)], SENSOR, cache, workers=2)
-    assert (calls / "0-0").exists()
+    assert files(calls)
     assert files(cache) == []
     [encoded] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(encoded.scans, direct(0))
@@ -145,6 +146,32 @@ def test_partial_file_of_a_killed_process_is_not_believed(tmp_path, calls):
     [encoded] = encode_sequences([sequence], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(encoded.scans, direct(0, 5))
     assert path.name in files(cache)
+
+
+def test_full_disk_is_told_in_a_line_and_leaves_nothing_of_what_did_not_fit(tmp_path, calls):
+    cache = tmp_path / "cache"
+    sequences = [make_sequence(calls, 0, frames=4), make_sequence(calls, 1), make_sequence(calls, 2)]
+    soft, hard = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (60_000, hard))
+    try:
+        with pytest.raises(
+            InputError, match=r"0 MB of encoded scans cannot be written \(.+\); make room"
+        ) as e:
+            encode_sequences(sequences, SENSOR, cache, workers=2)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
+    assert "\n" not in str(e.value)
+    assert set(files(cache)) <= {cache_path(sequences[0], SENSOR, cache).name}
+    for seed, encoded in enumerate(encode_sequences(sequences, SENSOR, cache, workers=2)):
+        np.testing.assert_array_equal(encoded.scans, direct(seed, len(encoded)))
+
+
+def test_result_does_not_depend_on_the_number_of_workers(tmp_path, calls):
+    sequences = [make_sequence(calls, seed, frames=30 + 50 * seed) for seed in range(4)]
+    one, three = (encode_sequences(sequences, SENSOR, tmp_path / str(n), workers=n) for n in (1, 3))
+    assert [drive.key for drive in one] == [drive.key for drive in three]
+    for name in files(tmp_path / "1"):
+        assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "3" / name).read_bytes()
 
 
 def test_part_is_a_view_of_the_same_frames():
@@ -175,17 +202,20 @@ def test_part_is_a_view_of_the_same_frames():
 def test_workers_end_when_their_parent_is_killed(tmp_path):
     folder, script = tmp_path / "cache", tmp_path / "encode.py"
     script.write_text(f"""
+from functools import partial
 from pathlib import Path
 from rcnn_odom.cache import encode_sequences
-from rcnn_odom.datasets.simulated import load
 from rcnn_odom.scan import Sensor
+from stub_drives import read
 if __name__ == "__main__":
-    encode_sequences([load("00", frames=20_000)], Sensor(), Path({str(folder)!r}), 2)
+    encode_sequences([read("00", seconds=0.01, frames=20_000)], Sensor(), Path({str(folder)!r}), 2)
 """)
-    parent = subprocess.Popen([sys.executable, str(script)], start_new_session=True)
+    environment = {"PYTHONPATH": ":".join(sys.path)}
+    parent = subprocess.Popen([sys.executable, str(script)], start_new_session=True, env=environment)
     # Itself, two workers and Python's resource tracker; a worker that has not begun ends by itself.
     wait_for(lambda: len(running(parent.pid)) == 4)
-    time.sleep(2)
+    wait_for(lambda: list(folder.glob(".*.partial")))
+    time.sleep(0.5)
     parent.kill()
     parent.wait()
     wait_for(lambda: not running(parent.pid))

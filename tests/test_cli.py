@@ -11,7 +11,10 @@ import pytest
 
 import rcnn_odom
 from rcnn_odom.cli import main
+from rcnn_odom.datasets import kitti, simulated
+from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import drift
+from rcnn_odom.motion import relative_motions
 from rcnn_odom.trajectory import read_kitti, write_kitti
 
 SOURCE = Path(rcnn_odom.__file__).parents[1]
@@ -194,3 +197,183 @@ print("torch" in sys.modules)
         [sys.executable, "-c", code], capture_output=True, text=True, env=environment, check=True
     )
     assert result.stdout.splitlines()[-1] == "False"
+
+
+HEADER = "frame,distance_m,heading_rad,true_distance_m,true_heading_rad"
+
+
+@pytest.fixture
+def motions(tmp_path):
+    """Four frames, too few to be smoothed: straight ahead, and a baseline that never moves."""
+    path = tmp_path / "05_motions.csv"
+    path.write_text(
+        f"{HEADER},held_motion_distance_m,held_motion_heading_rad\n"
+        "1,1.5,0,1,0,0,0\n2,1.25,0,1,0,0,0\n3,1.75,0,2,0,0,0\n4,2,0.01,2,0,0,0\n"
+    )
+    return path
+
+
+def test_frames_as_text(motions, capsys):
+    assert main(["frames", str(motions)]) == 0
+    title, _, groups, names, *rows = capsys.readouterr().out.splitlines()
+    assert title == "frames 1 to 4 of 4, a path of 6.00 m"
+    assert groups.split("-")[0].strip() == ""
+    assert names.split()[:4] == ["mean", "abs", "signed", "largest"]
+    # Errors of 0.5, 0.25, -0.25 and 0 m; the last turn comes before its step of 2 m, and 2 sin 0.01 = 0.02.
+    distance, heading = ["0.2500", "+0.1250", "0.5000"], ["0.1432", "+0.1432", "0.5730"]
+    assert rows[0].split() == ["estimate", *distance, *distance, *heading, "0.500", "8.34"]
+    still = ["1.5000", "-1.5000", "2.0000"]
+    right = ["0.0000", "+0.0000", "0.0000"]
+    assert rows[1].split() == ["held_motion", *still, *still, *right, "6.000", "100.00"]
+    assert len(rows) == 2
+    assert len({len(line) for line in (groups, names, *rows)}) == 1
+
+
+def test_frames_of_a_range_as_json(motions, capsys):
+    assert main(["frames", str(motions), "--frames", "2:3", "--apply", "start", "--json"]) == 0
+    result = json.loads(capsys.readouterr().out)
+    assert (result["frames"], result["apply"]) == ([2, 3], "start")
+    assert list(result["methods"]) == ["estimate", "held_motion"]
+    estimate = result["methods"]["estimate"]
+    assert estimate["distance_mae_m"] == pytest.approx(0.25)
+    assert estimate["distance_bias_m"] == pytest.approx(0, abs=1e-12)
+    assert (estimate["path_m"], estimate["end_m"], estimate["end_ratio"]) == (3, 0, 0)
+    assert result["methods"]["held_motion"]["end_ratio"] == pytest.approx(1)
+
+
+def test_frames_of_a_step_taken_before_its_turn(motions, capsys):
+    assert main(["frames", str(motions), "--frames", "4:4", "--apply", "start", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out)["methods"]["estimate"]["end_m"] == 0
+    assert main(["frames", str(motions), "--frames", "4:4", "--json"]) == 0
+    end = json.loads(capsys.readouterr().out)["methods"]["estimate"]["end_m"]
+    assert end == pytest.approx(4 * np.sin(0.005))  # a chord of 0.01 rad on a circle of 2 m
+
+
+@pytest.mark.parametrize("frames", ["2:5", "0:2", "5:9"])
+def test_frames_outside_of_the_drive(motions, capsys, frames):
+    assert main(["frames", str(motions), "--frames", frames]) == 1
+    message = f"05_motions.csv: --frames {frames} reaches outside of the drive, which has 4 frames: 1:4\n"
+    assert one_line_error(capsys).endswith(message)
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("", ".csv:1: the header must be frame,distance_m,heading_rad,true_distance_m,true_heading_rad"),
+        ("1 2 3\n", ".csv:1: the header must be"),
+        (f"{HEADER},slam_distance_m\n1,1,0,1,0,1\n", ".csv:1: the header must be"),
+        (f"{HEADER},true_distance_m,true_heading_rad\n1,1,0,1,0,1,0\n", ".csv:1: the header must be"),
+        (f"{HEADER}\n", ".csv: has no motion under its header"),
+        (f"{HEADER}\n1,1,0,1,0\n2,1,x,1,0\n", ".csv:3: not numbers: could not convert"),
+        (f"{HEADER}\n1,1,0,1\n", ".csv:2: found 4 fields where the header has 5"),
+        (f"{HEADER}\n1,1,0,1,0\n\n2,1,0,1,0\n", ".csv:3: found 1 fields where the header has 5"),
+        (f"{HEADER}\n1,nan,0,1,0\n", ".csv:2: a motion must be finite"),
+        (f"{HEADER}\n1,1,0,1,0\n3,1,0,1,0\n", ".csv:3: frame 3 where 2 comes"),
+    ],
+)
+def test_bad_files_of_motions_give_one_line(tmp_path, capsys, text, message):
+    (tmp_path / "bad.csv").write_text(text)
+    assert main(["frames", str(tmp_path / "bad.csv")]) == 1
+    assert message in one_line_error(capsys)
+
+
+def test_no_file_of_motions(tmp_path, capsys):
+    assert main(["frames", str(tmp_path / "none.csv")]) == 1
+    assert "none.csv: cannot be read: No such file" in one_line_error(capsys)
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        (["--frames", "39:20"], "'39:20' is empty"),
+        (["--frames", "20"], "'20' is not a range of frames such as 20:39"),
+        (["--frames", "a:b"], "is not a range of frames"),
+        (["--frames=-3:4"], "is not a range of frames"),
+        (["--apply", "never"], "invalid choice: 'never'"),
+    ],
+)
+def test_wrong_usage_of_frames(motions, capsys, options, message):
+    with pytest.raises(SystemExit) as exit_status:
+        main(["frames", str(motions), *options])
+    assert exit_status.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_simulate_writes_what_the_simulator_gives(tmp_path, capsys):
+    options = ["--sequence", "00", "my drive", "--frames", "3", "--seed", "7", "--without", "movers"]
+    assert main(["simulate", "--out", str(tmp_path / "out"), *options]) == 0
+    assert capsys.readouterr().out == (
+        f"wrote 00, my drive to {tmp_path}/out; score a trained network there: "
+        f'python evaluate.py data=kitti data.root={tmp_path}/out \'data.test=["00", "my drive"]\'\n'
+    )
+    for name in ("00", "my drive"):
+        made = simulated.load(name, frames=3, seed=7, movers=False)
+        read = kitti.load(name, root=tmp_path / "out")
+        np.testing.assert_allclose(relative_motions(read.poses), relative_motions(made.poses), atol=1e-9)
+        np.testing.assert_allclose(read.stamps, made.stamps, atol=1e-6)
+        for frame in range(3):
+            for ours, theirs in zip(made.read_scan(frame), read.read_scan(frame), strict=True):
+                np.testing.assert_array_equal(theirs, ours)
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """What the command asks of the simulator, which is not run."""
+    calls = []
+
+    def load(name, **options):
+        calls.append((name, options))
+        raise InputError(f"sequence {name}: asked for")
+
+    monkeypatch.setattr(simulated, "load", load)
+    return calls
+
+
+def test_simulate_passes_its_options_on(tmp_path, capsys, asked):
+    out = ["simulate", "--out", str(tmp_path)]
+    assert main(out) == 1
+    assert "sequence 00: asked for" in one_line_error(capsys)
+    options = {"world": "street", "scale": "small", "frames": None, "seed": 0}
+    assert asked.pop() == ("00", options | {"movers": True, "missing": True, "tilt": True})
+    without = ["--without", "tilt", "--without", "missing"]
+    assert main([*out, "--sequence", "a~2", "--world", "indoor", "--scale", "full", *without]) == 1
+    options = {"world": "indoor", "scale": "full", "frames": None, "seed": 0}
+    assert asked.pop() == ("a~2", options | {"movers": True, "missing": False, "tilt": False})
+
+
+def test_simulate_writes_nothing_if_one_is_there(tmp_path, capsys, asked):
+    (tmp_path / "sequences" / "05").mkdir(parents=True)
+    assert main(["simulate", "--out", str(tmp_path), "--sequence", "00", "05"]) == 1
+    assert "sequences/05: is there already; remove it" in one_line_error(capsys)
+    assert main(["simulate", "--out", str(tmp_path), "--sequence", "00", "../05"]) == 1
+    assert "sequence '../05': must be the name of a folder" in one_line_error(capsys)
+    assert asked == []
+
+
+def test_ctrl_c_gives_one_line(tmp_path, capsys, monkeypatch):
+    def stop(name, **options):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(simulated, "load", stop)
+    assert main(["simulate", "--out", str(tmp_path)]) == 130
+    assert capsys.readouterr().err == "rcnn-odom: interrupted\n"
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ([], "--out"),
+        (["--out", "x", "--frames", "1"], "'1' is not a whole number, 2 or more"),
+        (["--out", "x", "--frames", "many"], "'many' is not a whole number"),
+        (["--out", "x", "--seed", "abc"], "'abc' is not a whole number, 0 or more"),
+        (["--out", "x", "--seed=-1"], "'-1' is not a whole number"),
+        (["--out", "x", "--world", "moon"], "invalid choice: 'moon'"),
+        (["--out", "x", "--without", "wheels"], "invalid choice: 'wheels'"),
+        (["--out", "x", "--sequence"], "expected at least one argument"),
+    ],
+)
+def test_wrong_usage_of_simulate(capsys, options, message):
+    with pytest.raises(SystemExit) as exit_status:
+        main(["simulate", *options])
+    assert exit_status.value.code == 2
+    assert message in capsys.readouterr().err

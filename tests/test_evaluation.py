@@ -1,22 +1,30 @@
 """Scores of drives by hand."""
 
 import json
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.evaluation import (
     camera_trajectory,
     frame_errors,
+    frame_table,
     percent,
     planar_drift,
+    read_motions,
     score,
     score_all,
+    smooth,
+    stretch_errors,
     table,
+    write_motions,
 )
 from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
+from rcnn_odom.report import report_test
 
 
 def drive(planar, name="drive", camera_from_laser=FORWARD_CAMERA):
@@ -164,3 +172,83 @@ def test_baselines_repeat_one_motion():
 def test_odometry_that_never_moves_drifts_by_everything():
     report = score(straight(), held_motion().estimate(np.zeros((31, 3))), [10.0])
     assert report["drift"]["t_err"] == pytest.approx(1.1)
+
+
+# Weights that Savitzky and Golay printed for parabolas over 5 and over 11 points.
+PRINTED = {5: np.array([-3, 12, 17, 12, -3]) / 35}
+PRINTED[11] = np.array([-36, 9, 44, 69, 84, 89, 84, 69, 44, 9, -36]) / 429
+
+
+@pytest.mark.parametrize(("frames", "window"), [(5, 5), (6, 5), (11, 11), (12, 11), (40, 11)])
+def test_smoothing_has_the_printed_weights(frames, window):
+    distances = np.random.default_rng(3).normal(1, 0.05, frames)
+    middle = window // 2
+    assert smooth(distances)[middle] == pytest.approx(PRINTED[window] @ distances[:window])
+
+
+@pytest.mark.parametrize("frames", [1, 2, 3, 4])
+def test_too_few_frames_are_not_smoothed(frames):
+    distances = np.array([1.0, 4.0, -2.0, 0.5])[:frames]
+    np.testing.assert_allclose(smooth(distances), distances, atol=1e-12)
+
+
+def test_a_stretch_is_scored_against_the_truth_smoothed_over_the_whole_drive():
+    # The truth jumps by 1 m at one frame, of which the filter leaves 89/429 there and 84/429 beside it.
+    truth = np.tile([1.0, 0.0], (11, 1))
+    truth[5, 0] = 2.0
+    report = stretch_errors(np.tile([1.0, 0.01], (11, 1)), truth, slice(5, 7))
+    assert report["distance_mae_m"] == pytest.approx(0.5)
+    assert report["distance_bias_m"] == pytest.approx(-0.5)
+    assert report["distance_max_m"] == pytest.approx(1.0)
+    assert report["smoothed_distance_mae_m"] == pytest.approx((89 + 84) / 429 / 2)
+    assert report["smoothed_distance_bias_m"] == pytest.approx(-(89 + 84) / 429 / 2)
+    assert report["smoothed_distance_max_m"] == pytest.approx(89 / 429)
+    assert report["heading_bias_deg"] == pytest.approx(np.degrees(0.01))
+    assert report["moving"]["frames"] == 2
+    assert report["path_m"] == pytest.approx(3.0)
+
+
+@pytest.mark.parametrize(("apply", "end"), [("end", 7 * np.sqrt(2)), ("start", 4 * np.sqrt(2))])
+def test_the_end_point_of_a_stretch_by_hand(apply, end):
+    # From the second frame on: the truth turns left, to (0, 7) or (3, 4), the estimate goes to (7, 0).
+    truth = np.array([[5.0, 0.3], [3.0, np.pi / 2], [4.0, 0.0]])
+    motions = np.array([[9.0, -0.2], [3.0, 0.0], [4.0, 0.0]])
+    report = stretch_errors(motions, truth, slice(1, 3), apply)
+    assert report["path_m"] == pytest.approx(7)
+    assert report["end_m"] == pytest.approx(end)
+    assert report["end_ratio"] == pytest.approx(end / 7)
+
+
+def test_the_path_goes_on_in_reverse_and_a_standing_one_has_no_ratio():
+    truth = np.array([[2.0, 0.0], [-2.0, 0.0], [0.0, 0.0], [0.0, 0.0]])
+    motions = truth + np.array([0.1, 0.0])
+    assert stretch_errors(motions, truth, slice(0, 2))["end_ratio"] == pytest.approx(0.2 / 4)
+    standing = stretch_errors(motions, truth, slice(2, 4))
+    assert (standing["path_m"], standing["end_ratio"]) == (0.0, None)
+    assert standing["end_m"] == pytest.approx(0.2)
+    assert frame_table({"estimate": standing}).split()[-2:] == ["0.200", "-"]
+
+
+def test_motions_are_read_as_they_were_written(tmp_path):
+    motions, truth, held = np.random.default_rng(0).normal(size=(3, 4, 2)) / 3
+    write_motions(tmp_path / "motions.csv", motions, truth, {"held_motion": held})
+    read_truth, methods = read_motions(tmp_path / "motions.csv")
+    np.testing.assert_array_equal(read_truth, truth)
+    assert list(methods) == ["estimate", "held_motion"]
+    np.testing.assert_array_equal(methods["estimate"], motions)
+    np.testing.assert_array_equal(methods["held_motion"], held)
+
+
+def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
+    sequence = drive([(0, 0, 0), (1, 0, 0), (1, 1.5, 0.25)], "05")
+    module = SimpleNamespace(variant="cnn_reg", network=SimpleNamespace(head=SimpleNamespace()))
+    module.network.head.mean = torch.tensor([0.75, 0.5])
+    data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
+    report_test(module, {"05": np.array([[0.875, 0.0], [1.25, -0.5]])}, [sequence], data, tmp_path)
+    header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
+    assert header == (
+        "frame,distance_m,heading_rad,true_distance_m,true_heading_rad,"
+        "mean_motion_distance_m,mean_motion_heading_rad,held_motion_distance_m,held_motion_heading_rad"
+    )
+    assert first == "1,0.875,0,1,0,0.75,0.5,0,0"
+    assert second == "2,1.25,-0.5,1.5,0.25,0.75,0.5,0,0"

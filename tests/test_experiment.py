@@ -1,6 +1,8 @@
 """Whole experiments on tiny recordings in the real layouts."""
 
 import json
+import multiprocessing
+import re
 import subprocess
 import sys
 
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 import torch
 import yaml
-from hydra.utils import instantiate
+from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from conftest import ROOT
@@ -18,6 +20,7 @@ from evaluate import evaluate
 from rcnn_odom import cli, experiment
 from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import travelled
+from rcnn_odom.modules import OdometryModule
 from rcnn_odom.runs import BEST, LAST, fingerprint
 from rcnn_odom.settings import plain
 from train import train
@@ -293,11 +296,133 @@ def test_training_that_diverges_says_so(configure, kitti):
         )
 
 
-@pytest.mark.parametrize("split", ["val", "test"])
-def test_the_shipped_simulation_has_long_drives(configure, split):
-    data = plain(configure("data=simulated"))["data"]
-    for name in data[split]:
-        assert travelled(instantiate(data["reader"], name).poses)[-1] > 800
+# --- the simulation ------------------------------------------------------------------------------
+
+STUB = [
+    "data=simulated",
+    "data.reader._target_=stub_drives.read",
+    "data.train=['00','02']",
+    "data.test=['05']",
+    "data.sensor.max_range=40.0",
+    LENGTHS,
+]
+FRESH = [*STUB, "data.fresh_worlds=true", "model.epochs=3"]
+
+
+def scans_trained_on(monkeypatch):
+    """Fills with one number for each training batch, by which its scans are told from others."""
+    seen = []
+    step = OdometryModule.training_step
+
+    def training_step(self, batch, index):
+        seen.append(float(batch["pairs"].double().sum()))
+        return step(self, batch, index)
+
+    monkeypatch.setattr(OdometryModule, "training_step", training_step)
+    return seen
+
+
+def test_stopped_run_on_fresh_worlds_goes_on_with_the_same_worlds(configure, tmp_path, monkeypatch, caplog):
+    caplog.set_level("INFO")
+    seen = scans_trained_on(monkeypatch)
+    whole = train(configure("model=cnn_reg", *FRESH, "data.workers=2", run="whole"))
+    expected = seen.copy()
+    assert len(set(expected)) == len(expected)
+    seen.clear()
+
+    def stop(self, trainer, module):
+        if trainer.current_epoch == 2:
+            raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(experiment.EpochLines, "on_train_epoch_start", stop, raising=False)
+        with pytest.raises(KeyboardInterrupt):
+            train(configure("model=cnn_reg", *FRESH))
+    assert multiprocessing.active_children() == []
+    assert train(configure("model=cnn_reg", *FRESH))["test"] == whole["test"]
+    assert seen == expected
+    assert multiprocessing.active_children() == []
+    assert "new worlds for every epoch" in caplog.text
+    assert len(list((tmp_path / "outputs" / "cache").iterdir())) == 4, "the new worlds leave no file"
+
+
+def test_first_stage_has_fresh_worlds_too(configure, caplog):
+    caplog.set_level("INFO")
+    train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=2"))
+    assert caplog.text.count("new worlds for every epoch") == 2
+
+
+def test_first_stage_on_fixed_worlds_does_not_serve_for_fresh_ones(configure):
+    prints = set()
+    for fresh in ("true", "false"):
+        settings = plain(configure("model=cnn_cls", *FRESH, f"data.fresh_worlds={fresh}"))
+        prints.add(fingerprint(settings, experiment.build_datamodule(settings).load(("train", "val"))))
+    assert len(prints) == 2
+
+
+def test_log_tells_how_long_training_waited(configure, caplog):
+    caplog.set_level("INFO")
+    train(
+        configure("model=cnn_reg", *FRESH, "+data.reader.seconds=0.01", "data.train=['02']", "model.epochs=2")
+    )
+    epochs = [line for line in caplog.messages if line.startswith("epoch")]
+    assert [bool(re.search(r"waited \d s for new worlds$", line)) for line in epochs] == [False, True]
+
+
+def test_worlds_that_cannot_be_made_end_the_run_in_one_line(configure):
+    with pytest.raises(InputError) as failure:
+        train(configure("model=cnn_reg", *FRESH, "+data.reader.broken='00~1'"))
+    assert str(failure.value) == "00~1: frame 20 is damaged; copy it again"
+    assert multiprocessing.active_children() == []
+
+
+def test_simulated_drives_train_on_fresh_worlds(configure):
+    options = ["data=simulated", "data.frames=40", "data.train=['00']", "data.test=['05']", LENGTHS]
+    metrics = train(configure("model=cnn_reg", *options, "data.fresh_worlds=true"))
+    assert metrics["test"]["sequences"]["05"]["frames"] == 40
+
+
+@pytest.mark.parametrize("scale", ["small", "full"])
+def test_shipped_simulation_has_long_drives_to_score(configure, scale):
+    module = experiment.build_datamodule(plain(configure("data=simulated", f"data.scale={scale}")))
+    for name in (*module.names["val"], *module.names["test"]):
+        assert travelled(module.read(name).poses)[-1] > 400
+
+
+@pytest.mark.parametrize(
+    ("options", "epochs"),
+    [
+        (["data=simulated"], [60, 25]),
+        (["data=simulated", "data.scale=full"], [10, 5]),
+        (["data=simulated", "data.passes.small.cnn=3"], [3, 25]),
+        (["data=kitti", "data.root=x"], [10, 5]),
+        (["data=kitti", "data.root=x", "data.epochs.cnn=3"], [3, 5]),
+    ],
+)
+def test_small_training_set_has_more_epochs(options, epochs):
+    with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
+        for variant, expected in (("cnn_reg", epochs[0]), ("rcnn_reg", epochs[1])):
+            model = plain(compose("config", ["run_dir=x", f"model={variant}", *options]))["model"]
+            assert model["epochs"] == expected
+        assert model["first_stage"]["epochs"] == epochs[0]
+
+
+@pytest.mark.parametrize(
+    ("option", "message"),
+    [
+        ("data.scale=medium", "data.scale=medium: choose one of small, full"),
+        ("data.world=moon", "data.world=moon: choose one of street, indoor"),
+        ("data.frames=0", "data.frames=0: must be null or a whole number above 0"),
+        ("data.world_seed=abc", "data.world_seed=abc: must be a whole number, not negative"),
+        ("data.fresh_worlds=maybe", "data.fresh_worlds=maybe: must be true or false"),
+        ("data.realism.tilt=1", "data.realism.tilt=1: must be true or false"),
+        ("data.realism=false", "data.realism=False: set its parts"),
+        ("data.passes.small.cnn=0", "data.passes.small.cnn=0: must be a whole number above 0"),
+    ],
+)
+def test_bad_options_of_the_simulation_are_named(configure, option, message):
+    with pytest.raises(InputError, match=f"^{message}"):
+        plain(configure("data=simulated", option))
 
 
 @pytest.mark.parametrize("content", ["", "{", "a: 1", "[1]"])
@@ -329,7 +454,7 @@ def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, argum
 def test_help_prints_the_options():
     command = [sys.executable, str(ROOT / "train.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert "data: carmen, kitti, simulated" in done.stdout
+    assert "data: carmen, indoor, kitti, simulated" in done.stdout
     assert "kernel_size: 3" in done.stdout
 
 

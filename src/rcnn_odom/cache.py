@@ -4,13 +4,12 @@ import hashlib
 import json
 import logging
 import os
-import threading
 import time
-from concurrent.futures import ProcessPoolExecutor
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
-from multiprocessing import get_context, parent_process
 from pathlib import Path
+from types import TracebackType
 
 import numpy as np
 import numpy.typing as npt
@@ -19,13 +18,13 @@ from tqdm import tqdm
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame, relative_motions
-from rcnn_odom.scan import Sensor, encode
+from rcnn_odom.scan import Sensor
+from rcnn_odom.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
 
 ENCODING_VERSION = 1
 """Raised whenever ``rcnn_odom.scan.encode`` gives other numbers for the same input."""
-CHUNK = 64
 DAY = 86400.0
 
 
@@ -83,7 +82,7 @@ def encode_sequences(
     """The sequences with their depth vectors, from the cache or computed into it in parallel.
 
     Raises:
-        InputError: a frame cannot be read, or the folder cannot be made.
+        InputError: a frame cannot be read, or the folder cannot be made or is full.
     """
     paths = [cache_path(sequence, sensor, folder) for sequence in sequences]
     missing = {
@@ -92,27 +91,8 @@ def encode_sequences(
         if not _is_whole(path, (len(sequence), sensor.bins))
     }
     if missing:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise InputError(
-                f"{folder}: cannot hold encoded scans ({error.strerror}); set outputs="
-            ) from error
-        for left_over in folder.glob(".*.partial"):
-            if time.time() - left_over.stat().st_mtime > DAY:
-                left_over.unlink(missing_ok=True)
-        total = sum(len(sequence) for sequence in missing.values())
-        log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
-        # Fresh processes: a fork of one that has started torch's threads can hang.
-        pool = ProcessPoolExecutor(
-            workers,
-            get_context("spawn"),
-            initializer=_start_worker,
-            initargs=(list(missing.values()), sensor),
-        )
-        with pool, tqdm(total=total, desc="encoding scans", unit="scan", disable=None) as bar:
-            for number, (path, sequence) in enumerate(missing.items()):
-                _write_cache(path, number, (len(sequence), sensor.bins), pool, bar)
+        _make_folder(folder)
+        _encode_into(missing, sensor, workers)
     return [
         EncodedSequence(
             name=sequence.name,
@@ -137,49 +117,83 @@ def _is_whole(path: Path, shape: tuple[int, int]) -> bool:
         return False
 
 
-_work: tuple[list[Sequence], Sensor]
-"""In a worker process: what there is to encode. Sent once, since a log can be large."""
-
-
-def _start_worker(sequences: list[Sequence], sensor: Sensor) -> None:
-    global _work
-    _work = sequences, sensor
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A killed parent cannot tell its workers to end, and they would wait for it forever."""
-    parent = parent_process()
-    if parent is not None:
-        parent.join()
-        os._exit(1)
-
-
-def _encode_frames(number: int, start: int, stop: int) -> npt.NDArray[np.float32]:
-    sequences, sensor = _work
-    read_scan = sequences[number].read_scan
-    return np.stack([encode(*read_scan(frame), sensor) for frame in range(start, stop)])
-
-
-def _write_cache(
-    path: Path, number: int, shape: tuple[int, int], pool: ProcessPoolExecutor, bar: tqdm
-) -> None:
-    """The file gets its final name only when it is complete and on disk.
-
-    A killed run therefore leaves nothing that a later one would believe.
-    """
-    partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
-    starts = range(0, shape[0], CHUNK)
-    stops = [min(start + CHUNK, shape[0]) for start in starts]
+def _make_folder(folder: Path) -> None:
     try:
-        scans = np.lib.format.open_memmap(partial, mode="w+", dtype=np.float32, shape=shape)
-        blocks = pool.map(_encode_frames, [number] * len(starts), starts, stops)
-        for start, stop, block in zip(starts, stops, blocks, strict=True):
-            scans[start:stop] = block
-            bar.update(stop - start)
-        scans.flush()
-        with partial.open("rb") as file:
-            os.fsync(file.fileno())
-        partial.replace(path)
-    finally:
-        partial.unlink(missing_ok=True)
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{folder}: cannot hold encoded scans ({error.strerror}); set outputs=") from error
+    for left_over in folder.glob(".*.partial"):
+        if time.time() - left_over.stat().st_mtime > DAY:
+            left_over.unlink(missing_ok=True)
+
+
+def _encode_into(missing: dict[Path, Sequence], sensor: Sensor, workers: int) -> None:
+    lengths = [len(sequence) for sequence in missing.values()]
+    total = sum(lengths)
+    folder = next(iter(missing)).parent
+    log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
+    by_name = {path.name: sequence for path, sequence in missing.items()}
+    with ExitStack() as stack:
+        pool = stack.enter_context(Workers(useful_workers(workers, total), by_name.__getitem__, sensor))
+        bar = stack.enter_context(tqdm(total=total, desc="encoding scans", unit="scan", disable=None))
+        files = [
+            stack.enter_context(_PartialFile(path, (length, sensor.bins)))
+            for path, length in zip(missing, lengths, strict=True)
+        ]
+        for number, start, scans, _ in pool.encode(list(by_name), lengths):
+            files[number].write(start, scans)
+            bar.update(len(scans))
+
+
+class _PartialFile:
+    """An array (N, bins) on its way to disk: it gets its final name only when all of it is there.
+
+    A killed run therefore leaves nothing that a later one would believe. It is not a memory map,
+    because on a full disk that kills the process.
+    """
+
+    def __init__(self, path: Path, shape: tuple[int, int]) -> None:
+        self.path, self.shape = path, shape
+        self.missing = shape[0]
+        self.partial = path.with_name(f".{path.stem}.{os.getpid()}.partial")
+
+    def __enter__(self) -> "_PartialFile":
+        description = {"descr": "<f4", "fortran_order": False, "shape": self.shape}
+        try:
+            with self.partial.open("wb") as file:
+                np.lib.format.write_array_header_1_0(file, description)
+                self.header = file.tell()
+        except OSError as error:
+            raise self._refusal(error) from error
+        return self
+
+    def write(self, start: int, scans: npt.NDArray[np.float32]) -> None:
+        """Rows from ``start`` on.
+
+        Raises:
+            InputError: the disk is full.
+        """
+        self.missing -= len(scans)
+        try:
+            with self.partial.open("r+b") as file:
+                file.seek(self.header + start * scans[0].nbytes)
+                file.write(scans.astype("<f4", copy=False).data)
+                if not self.missing:
+                    file.flush()
+                    os.fsync(file.fileno())
+            if not self.missing:
+                self.partial.replace(self.path)
+        except OSError as error:
+            raise self._refusal(error) from error
+
+    def _refusal(self, error: OSError) -> InputError:
+        megabytes = 4e-6 * self.shape[0] * self.shape[1]
+        return InputError(
+            f"{self.path}: {megabytes:.0f} MB of encoded scans cannot be written ({error.strerror}); "
+            "make room there, or set outputs= to another place"
+        )
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.partial.unlink(missing_ok=True)

@@ -4,8 +4,9 @@ import argparse
 import json
 import math
 import os
+import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -25,7 +26,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         argv: arguments without the program's name; None takes those of the process.
 
     Returns:
-        Exit status: 0, or 1 after one line on stderr about bad input. Wrong usage exits with 2.
+        Exit status: 0, or 1 after one line on stderr about bad input, or 130 after Ctrl-C. Wrong usage
+        exits with 2.
     """
     arguments = _build_parser().parse_args(argv)
     try:
@@ -38,6 +40,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     except (InputError, OSError) as error:
         print(f"rcnn-odom: error: {error}", file=sys.stderr)
         return 1
+    except KeyboardInterrupt:
+        print("rcnn-odom: interrupted", file=sys.stderr)
+        return 130
     return status
 
 
@@ -46,6 +51,8 @@ def _build_parser() -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"rcnn-odom {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     _add_drift(commands)
+    _add_frames(commands)
+    _add_simulate(commands)
     return parser
 
 
@@ -67,7 +74,7 @@ def _add_drift(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") 
     )
     parser.add_argument(
         "--step",
-        type=_parse_step,
+        type=_whole_number(1),
         default=10,
         metavar="N",
         help="frames between segment starts (%(default)s)",
@@ -86,10 +93,13 @@ def _parse_lengths(text: str) -> tuple[float, ...]:
     return lengths
 
 
-def _parse_step(text: str) -> int:
-    if not text.isdecimal() or int(text) < 1:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a whole number of frames, 1 or more")
-    return int(text)
+def _whole_number(least: int) -> Callable[[str], int]:
+    def parse(text: str) -> int:
+        if not text.isdecimal() or int(text) < least:
+            raise argparse.ArgumentTypeError(f"{text!r} is not a whole number, {least} or more")
+        return int(text)
+
+    return parse
 
 
 def _run_drift(arguments: argparse.Namespace) -> int:
@@ -133,6 +143,123 @@ def _format_drift(result: "Drift", planar: bool, step: int) -> str:
         rotation = f"{part.r_err_deg_per_m:16.6f}"
         lines.append(f"{length:10g}  {part.segments:8d}  {100 * part.t_err:9.4f}  {rotation}")
     return "\n".join(lines)
+
+
+def _add_frames(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = commands.add_parser(
+        "frames",
+        help="errors of a drive's single frames",
+        description="Errors of distance and heading a frame, against the truth and against a smoothed true "
+        "distance (that of a GPS jitters), and of the end point of the motions put together.",
+    )
+    parser.add_argument("motions", type=Path, metavar="MOTIONS.csv", help="RUN/trajectories/*_motions.csv")
+    parser.add_argument(
+        "--frames",
+        type=_parse_frames,
+        metavar="FIRST:LAST",
+        help="only these, both included; a frame is the motion to the scan of this number (all, from 1)",
+    )
+    parser.add_argument(
+        "--apply",
+        choices=["start", "middle", "end"],
+        default="end",
+        help="where along its turn a step is taken (%(default)s)",
+    )
+    parser.add_argument("--json", action="store_true", help="print JSON: the end point's error as a ratio")
+    parser.set_defaults(run=_run_frames)
+
+
+def _parse_frames(text: str) -> tuple[int, int]:
+    first, _, last = text.partition(":")
+    if not (first.isdecimal() and last.isdecimal()):
+        raise argparse.ArgumentTypeError(f"{text!r} is not a range of frames such as 20:39")
+    if int(first) > int(last):
+        raise argparse.ArgumentTypeError(f"{text!r} is empty: its last frame comes before its first")
+    return int(first), int(last)
+
+
+def _run_frames(arguments: argparse.Namespace) -> int:
+    from rcnn_odom.evaluation import frame_table, read_motions, stretch_errors
+
+    truth, estimates = read_motions(arguments.motions)
+    first, last = arguments.frames or (1, len(truth))
+    if first < 1 or last > len(truth):
+        raise InputError(
+            f"{arguments.motions}: --frames {first}:{last} reaches outside of the drive, "
+            f"which has {len(truth)} frames: 1:{len(truth)}"
+        )
+    chosen = slice(first - 1, last)
+    reports = {
+        method: stretch_errors(motions, truth, chosen, arguments.apply)
+        for method, motions in estimates.items()
+    }
+    if arguments.json:
+        print(json.dumps({"frames": [first, last], "apply": arguments.apply, "methods": reports}, indent=2))
+        return 0
+    path = reports["estimate"]["path_m"]
+    print(f"frames {first} to {last} of {len(truth)}, a path of {path:.2f} m\n\n{frame_table(reports)}")
+    return 0
+
+
+def _add_simulate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]") -> None:
+    parser = commands.add_parser(
+        "simulate",
+        help="write simulated drives in KITTI's layout",
+        description="Write simulated drives as DIR/sequences/NAME/{velodyne/*.bin,calib.txt,times.txt} and "
+        "DIR/poses/NAME.txt, for data=kitti and other tools. The same options give the same files.",
+    )
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder to write to, made where missing")
+    add("--layout", choices=["kitti"], default="kitti", help="of the files (%(default)s)")
+    add(
+        "--sequence",
+        nargs="+",
+        default=["00"],
+        metavar="NAME",
+        help="any names, each a world and a drive of its own (00)",
+    )
+    add(
+        "--frames",
+        type=_whole_number(2),
+        metavar="N",
+        help="scans in each sequence, whatever its name and scale",
+    )
+    add("--scale", choices=["small", "full"], default="small", help="full: 00 to 10 are as long as KITTI's")
+    add("--world", choices=["street", "indoor"], default="street", help="where it drives (%(default)s)")
+    add("--seed", type=_whole_number(0), default=0, metavar="S", help="other worlds (%(default)s)")
+    add(
+        "--without",
+        action="append",
+        choices=["movers", "missing", "tilt"],
+        default=[],
+        help="leave out what moves, missing returns, or slopes and the car's tilt; can be repeated",
+    )
+    parser.set_defaults(run=_run_simulate)
+
+
+def _run_simulate(arguments: argparse.Namespace) -> int:
+    from rcnn_odom.datasets import simulated
+    from rcnn_odom.datasets.export import export_kitti, need_free_name
+
+    root, names = arguments.out, list(dict.fromkeys(arguments.sequence))
+    for name in names:
+        need_free_name(root, name)
+    for name in names:
+        sequence = simulated.load(
+            name,
+            world=arguments.world,
+            scale=arguments.scale,
+            frames=arguments.frames,
+            seed=arguments.seed,
+            movers="movers" not in arguments.without,
+            missing="missing" not in arguments.without,
+            tilt="tilt" not in arguments.without,
+        )
+        export_kitti(sequence, root)
+    tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
+    command = f"python evaluate.py data=kitti {shlex.quote(f'data.root={root}')} {tests}"
+    print(f"wrote {', '.join(names)} to {root}; score a trained network there: {command}")
+    return 0
 
 
 if __name__ == "__main__":

@@ -16,6 +16,7 @@ from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 from rcnn_odom.cache import EncodedSequence, encode_sequences
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
+from rcnn_odom.fresh import FreshWorlds
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.scan import Sensor
 
@@ -119,6 +120,24 @@ class WindowSampler(Sampler[Draw]):
             yield int(frame), int(rng.integers(2**32)), self.mirror and bool(rng.integers(2))
 
 
+class FreshSampler(WindowSampler):
+    """Draws windows out of other drives in every epoch, as long as the first epoch's.
+
+    Args:
+        windows: of the first epoch's drives. worlds: the drives of every epoch.
+        mirror, seed: as for :class:`WindowSampler`.
+    """
+
+    def __init__(self, windows: Windows, worlds: FreshWorlds, mirror: bool, seed: int) -> None:
+        super().__init__([len(drive) for drive in worlds.drives], windows.length, mirror, seed)
+        self.windows, self.worlds = windows, worlds
+
+    def set_epoch(self, epoch: int) -> None:
+        """Lightning calls this before each epoch, of a resumed run as well."""
+        super().set_epoch(epoch)
+        self.windows.sequences = self.worlds.of(epoch)
+
+
 class Drives(Dataset):
     """Whole sequences in order, each one item: its ``number`` and ``scans`` (N, bins) in metres."""
 
@@ -144,6 +163,8 @@ class OdometryDataModule(L.LightningDataModule):
         max_turn_deg, mirror: label-exact augmentation of the training windows; 0 and False: none.
         cache_dir: where encoded scans are kept. workers: processes that encode; None for all cores.
         seed: of the order and the augmentation.
+        fresh_epochs: of a training on new worlds in every epoch, where ``read`` makes a drive for any
+            name: see :class:`rcnn_odom.fresh.FreshWorlds`. 0: every epoch sees the same drives.
     """
 
     def __init__(
@@ -160,6 +181,7 @@ class OdometryDataModule(L.LightningDataModule):
         mirror: bool = False,
         workers: int | None = None,
         seed: int = 0,
+        fresh_epochs: int = 0,
     ) -> None:
         super().__init__()
         self.read, self.sensor, self.cache_dir = read, sensor, Path(cache_dir)
@@ -168,16 +190,17 @@ class OdometryDataModule(L.LightningDataModule):
         self.max_turn_bins, self.mirror = round(max_turn_deg / sensor.resolution_deg), mirror
         self.workers = workers or os.cpu_count() or 1
         self.sequences: dict[str, list[EncodedSequence]] = {}
+        self.fresh_epochs = fresh_epochs
+        self.worlds: FreshWorlds | None = None
 
     def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
         """Reads and encodes the sequences of these splits.
 
         Raises:
-            InputError: a split is empty; a recording is missing, damaged or shorter than a window.
+            InputError: a split is empty; a recording is missing, damaged or shorter than a window; new
+                worlds are wanted in place of a part of a drive.
         """
-        for split in splits:
-            if not self.names[split]:
-                raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
+        self._check_names(splits)
         wanted = [parse_part(name) for split in splits for name in self.names[split]]
         files = list(dict.fromkeys(file for file, _, _ in wanted))
         recordings = [self.read(file) for file in files]
@@ -191,6 +214,18 @@ class OdometryDataModule(L.LightningDataModule):
             self.sequences[split] = [cut(encoded, name) for name in self.names[split]]
         self._check_windows()
         return self
+
+    def _check_names(self, splits: tuple[str, ...]) -> None:
+        for split in splits:
+            if not self.names[split]:
+                raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
+        for name in self.names["train"]:
+            whole = parse_part(name)[0]
+            if self.fresh_epochs and whole != name:
+                raise InputError(
+                    f"data.train={name}: new worlds come as whole drives; set data.fresh_worlds=false, "
+                    f"or name {whole}"
+                )
 
     def _check_windows(self) -> None:
         for sequence in self.sequences.get("train", []):
@@ -218,9 +253,15 @@ class OdometryDataModule(L.LightningDataModule):
         """
         sequences = self.sequences["train"]
         self._check_windows()
-        sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
-        batch_size = min(self.batch_size, len(sampler))
         windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)
+        sampler: WindowSampler
+        if self.fresh_epochs:
+            self.close()
+            self.worlds = FreshWorlds(self.read, sequences, self.fresh_epochs, self.sensor, self.workers)
+            sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
+        else:
+            sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
+        batch_size = min(self.batch_size, len(sampler))
         # A batch is gathered in one call, so there is nothing to collate; worker processes would only
         # copy what a memory map gives for nothing.
         return DataLoader(
@@ -228,6 +269,19 @@ class OdometryDataModule(L.LightningDataModule):
             batch_sampler=BatchSampler(sampler, batch_size, drop_last=True),  # type: ignore[arg-type]
             collate_fn=_as_is,
         )
+
+    def close(self) -> None:
+        """Ends what is being made of new worlds."""
+        if self.worlds is not None:
+            self.worlds.close()
+
+    def teardown(self, stage: str) -> None:
+        """Lightning's hook after training."""
+        self.close()
+
+    def on_exception(self, exception: BaseException) -> None:
+        """Lightning's hook when training is stopped or fails."""
+        self.close()
 
     def val_dataloader(self) -> DataLoader:
         """Whole validation sequences, one an item."""

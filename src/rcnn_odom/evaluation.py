@@ -1,16 +1,20 @@
-"""Scores of estimated motions: drift, its floor, and the errors of single frames."""
+"""Scores of estimated motions: drift, its floor, and the errors of single frames; files of motions."""
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import Drift, drift
 from rcnn_odom.motion import ApplyStep, FloatArray, change_frame, compose, wrap_angle
 
 STANDING = (0.01, np.deg2rad(0.2))
 """A frame stands still when it moves less than this, metres and radians: the noise of good odometry."""
+SMOOTHING = 11
+"""Frames under the filter that takes the jitter out of a true distance: a second of KITTI."""
 
 Report = dict[str, Any]
 """Plain numbers under names, ready for JSON."""
@@ -75,6 +79,42 @@ def _errors(error: FloatArray) -> Report:
     return report
 
 
+def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply: ApplyStep = "end") -> Report:
+    """Errors of a stretch of a drive: of its single frames, and of the place where it ends.
+
+    Args:
+        motions: estimated, of the whole drive, (N, 2) metres and radians.
+        truth: of the whole drive, (N, 2).
+        chosen: rows of the stretch, at least one.
+        apply: where along its turn a step is taken, for both.
+
+    Returns:
+        What :func:`frame_errors` tells, ``smoothed_distance_*`` against the smoothed true distance,
+        ``path_m``, and of the motions composed from the stretch's start ``end_m`` and ``end_ratio``, the
+        part of the path (None where the truth stands still).
+    """
+    report = frame_errors(motions[chosen], truth[chosen])
+    smoothed = np.column_stack([smooth(truth[:, 0]), truth[:, 1]])
+    against_smoothed = frame_errors(motions[chosen], smoothed[chosen])
+    for name in ("distance_mae_m", "distance_bias_m", "distance_max_m"):
+        report[f"smoothed_{name}"] = against_smoothed[name]
+    estimate_end, true_end = (compose(every[chosen], apply)[-1, :3, 3] for every in (motions, truth))
+    end, path = float(np.linalg.norm(estimate_end - true_end)), float(np.abs(truth[chosen, 0]).sum())
+    return {**report, "path_m": path, "end_m": end, "end_ratio": end / path if path else None}
+
+
+def smooth(distances: FloatArray) -> FloatArray:
+    """Distances (N,) without the jitter of a GPS: Savitzky-Golay, parabolas over ``SMOOTHING`` frames.
+
+    Fewer frames are smoothed over the largest odd number of them; up to four come back as they are.
+    """
+    from scipy.signal import savgol_filter  # A second to import, which a training has no use for.
+
+    window = min(SMOOTHING, len(distances) - (len(distances) + 1) % 2)
+    smoothed: FloatArray = savgol_filter(distances, window, polyorder=min(2, window - 1))
+    return smoothed
+
+
 def score_all(
     sequences: list[EncodedSequence],
     motions: Mapping[str, FloatArray],
@@ -121,3 +161,91 @@ def table(reports: Mapping[str, Report]) -> str:
 def percent(ratio: float | None) -> str:
     """A ratio in percent; a dash where no segment was long enough to have one."""
     return "-" if ratio is None else f"{100 * ratio:.2f}"
+
+
+def frame_table(reports: Mapping[str, Report]) -> str:
+    """Text with a row for each method: errors of distance and heading a frame, and of the end point.
+
+    Args:
+        reports: of :func:`stretch_errors` by the name of the method.
+    """
+    label, width = max(map(len, reports)), 10
+    groups = {"distance, m": 3, "to smoothed truth, m": 3, "heading, deg": 3, "end point": 2}
+    titles = ["  " + f" {title} ".center(width * count - 2, "-") for title, count in groups.items()]
+    names = [*["mean abs", "signed", "largest"] * 3, "m", "% of path"]
+    lines = [" " * label + "".join(titles), " " * label + "".join(name.rjust(width) for name in names)]
+    for method, report in reports.items():
+        cells = []
+        for kind in ("distance_{}_m", "smoothed_distance_{}_m", "heading_{}_deg"):
+            mae, bias, largest = (report[kind.format(name)] for name in ("mae", "bias", "max"))
+            cells += [f"{mae:.4f}", f"{bias:+.4f}", f"{largest:.4f}"]
+        cells += [f"{report['end_m']:.3f}", percent(report["end_ratio"])]
+        lines.append(method.ljust(label) + "".join(cell.rjust(width) for cell in cells))
+    return "\n".join(lines)
+
+
+def write_motions(
+    path: str | Path, motions: FloatArray, truth: FloatArray, baselines: Mapping[str, FloatArray]
+) -> None:
+    """Write CSV with a line for each motion, under the number of its later scan, in full precision.
+
+    Args:
+        path: file to write.
+        motions: estimated, (N, 2) metres and radians.
+        truth: (N, 2).
+        baselines: (N, 2) by the name of the method, which goes before the names of its columns.
+    """
+    rows = np.column_stack([np.arange(1, len(truth) + 1), motions, truth, *baselines.values()])
+    formats = ["%d"] + ["%.17g"] * (rows.shape[1] - 1)
+    header = ",".join(_motion_columns(baselines))
+    np.savetxt(path, rows, fmt=formats, delimiter=",", header=header, comments="")
+
+
+def _motion_columns(baselines: Iterable[str]) -> list[str]:
+    prefixes = ["", "true_", *(f"{name}_" for name in baselines)]
+    return ["frame", *(prefix + unit for prefix in prefixes for unit in ("distance_m", "heading_rad"))]
+
+
+def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Read what :func:`write_motions` wrote.
+
+    Returns:
+        The truth (N, 2), N >= 1, and motions (N, 2) by method, the first one called ``estimate``.
+
+    Raises:
+        InputError: the file cannot be read, has another header or no motion, or a line (which is named)
+            is not the next frame with a finite number in each column.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    header = lines[0].split(",") if lines else []
+    baselines = [name.removesuffix("_distance_m") for name in header[5::2]]
+    methods = ["estimate", "true", *baselines]
+    if header != _motion_columns(baselines) or len(set(methods)) < len(methods):
+        raise InputError(
+            f"{path}:1: the header must be {','.join(_motion_columns([]))}, then "
+            "METHOD_distance_m,METHOD_heading_rad for each other method, if any"
+        )
+    if len(lines) == 1:
+        raise InputError(f"{path}: has no motion under its header: give a file with one line a frame")
+    rows = [_parse_motions(line, frame, len(header), path) for frame, line in enumerate(lines[1:], start=1)]
+    columns = dict(zip(methods, np.split(np.array(rows), len(methods), axis=1), strict=True))
+    return columns.pop("true"), columns
+
+
+def _parse_motions(line: str, frame: int, columns: int, path: str | Path) -> list[float]:
+    where = f"{path}:{frame + 1}"
+    fields = line.split(",")
+    if len(fields) != columns:
+        raise InputError(f"{where}: found {len(fields)} fields where the header has {columns}")
+    try:
+        number, *motions = map(float, fields)
+    except ValueError as error:
+        raise InputError(f"{where}: not numbers: {error}") from error
+    if not np.isfinite(motions).all():
+        raise InputError(f"{where}: a motion must be finite, found nan or inf")
+    if number != frame:
+        raise InputError(f"{where}: frame {fields[0]} where {frame} comes: frames count 1, 2, 3, ...")
+    return motions

@@ -35,7 +35,8 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
     """The DataModule of a configuration; nothing has been read yet."""
     data, model = settings["data"], settings["model"]
     return OdometryDataModule(
-        read=instantiate({**data["reader"], "_partial_": True}),
+        # Plain values travel to the workers; Hydra's own containers would bring all of Hydra along.
+        read=instantiate({**data["reader"], "_partial_": True, "_convert_": "all"}),
         train=data["train"],
         val=data["val"],
         test=data["test"],
@@ -45,6 +46,7 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
         batch_size=model["batch_size"],
         workers=data["workers"],
         seed=settings["seed"],
+        fresh_epochs=model["epochs"] if data.get("fresh_worlds") else 0,
         **data["augment"],
     )
 
@@ -76,8 +78,11 @@ class EpochLines(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Called after the epoch's validation."""
         values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        worlds = trainer.datamodule.worlds  # type: ignore[attr-defined]
+        waited = f"  waited {worlds.waited:.0f} s for new worlds" if worlds and worlds.waited > 0.5 else ""
         log.info(
-            "epoch %2d/%d  loss %.4f  validation: drift %5s %%, mean error a frame %.3f m %.3f deg  %4.0f s",
+            "epoch %2d/%d  loss %.4f  validation: drift %5s %%, mean error a frame %.3f m %.3f deg  %4.0f s"
+            "%s",
             trainer.current_epoch + 1,
             trainer.max_epochs,
             values["train/loss_epoch"],
@@ -85,6 +90,7 @@ class EpochLines(Callback):
             values["val/distance_mae_m"],
             values["val/heading_mae_deg"],
             time.monotonic() - self.start,
+            waited,
         )
 
 

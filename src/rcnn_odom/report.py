@@ -10,7 +10,7 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
+from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table, write_motions
 from rcnn_odom.figures import motion_figure, trajectory_figure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
@@ -46,17 +46,18 @@ def report_test(
         ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name, and
         the ``versions`` of what computed them.
     """
-    estimates = {module.variant: motions, **baseline_motions(module, sequences)}
+    baselines = baseline_motions(module, sequences)
     reports = {
         method: score_all(sequences, estimated, data["lengths"], data["apply"])
-        for method, estimated in estimates.items()
+        for method, estimated in {module.variant: motions, **baselines}.items()
     }
     log.info("\n%s\n", table(reports))
     test = reports.pop(module.variant)
     for sequence in sequences:
         drift = percent(test["sequences"][sequence.name]["drift"]["t_err"])
         title = f"{module.variant} on {data['name']} {sequence.name}: drift {drift} %"
-        write_sequence(sequence, motions[sequence.name], title, data, folder, logger)
+        others = {method: estimated[sequence.name] for method, estimated in baselines.items()}
+        write_sequence(sequence, motions[sequence.name], others, title, data, folder, logger)
     versions = {package: version(package) for package in PACKAGES}
     return {"test": test, "baselines": reports, "versions": versions}
 
@@ -75,12 +76,13 @@ def baseline_motions(module: OdometryModule, sequences: list[EncodedSequence]) -
 def write_sequence(
     sequence: EncodedSequence,
     motions: FloatArray,
+    baselines: dict[str, FloatArray],
     title: str,
     data: Settings,
     folder: Path,
     logger: TensorBoardLogger | None,
 ) -> None:
-    """One sequence's trajectory in KITTI and TUM format, its truth, and the paper's two figures of it."""
+    """One sequence's trajectory in KITTI and TUM format, its truth, motions, and the paper's two figures."""
     name = re.sub(r"[^\w.-]+", "_", sequence.name.replace(":", "-")).strip("_")
     for kind in ("trajectories", "figures"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
@@ -88,6 +90,7 @@ def write_sequence(
     write_kitti(folder / "trajectories" / f"{name}.txt", poses)
     write_kitti(folder / "trajectories" / f"{name}_truth.txt", sequence.camera_poses)
     write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, poses)
+    write_motions(folder / "trajectories" / f"{name}_motions.csv", motions, sequence.motions, baselines)
     figures = {
         "trajectory": trajectory_figure(title, sequence.poses, compose(motions, data["apply"])),
         "motion": motion_figure(title, sequence.motions, motions),

@@ -85,6 +85,7 @@ def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
         for split in ("train", "val")
     }
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
+    data["fresh_worlds"] = settings["data"].get("fresh_worlds", False)
     parts = [RECIPE_VERSION, recordings, data, settings["model"], settings["trainer"], settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 

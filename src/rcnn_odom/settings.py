@@ -47,10 +47,17 @@ RULES: dict[str, Rule] = {
     "angle": _one_of("expectation", "argmax"),
     "apply": _one_of("start", "middle", "end"),
     "kernel_size": (lambda value: _is_count(value) and value % 2 == 1, "must be odd; the paper uses 3"),
-    **dict.fromkeys(("count", "hidden_size", "layers", "epochs", "window", "batch_size", "frames"), COUNT),
+    **dict.fromkeys(
+        ("count", "hidden_size", "layers", "epochs", "cnn", "rcnn", "window", "batch_size"), COUNT
+    ),
     **dict.fromkeys(("beta", "learning_rate", "width_deg", "regression", "classification"), POSITIVE),
     **dict.fromkeys(("resolution_deg", "field_of_view_deg", "max_range"), POSITIVE),
     **dict.fromkeys(("freeze", "mirror", "per_sample_norm"), FLAG),
+    **dict.fromkeys(("fresh_worlds", "movers", "missing", "tilt"), FLAG),
+    # All of it at once would leave nothing to look its parts up in.
+    "realism": (lambda value: False, "set its parts: movers, missing, tilt"),
+    "world": _one_of("street", "indoor"),
+    "scale": _one_of("small", "full"),
     **dict.fromkeys(("train", "val", "test"), NAMES),
     "lengths": (
         lambda value: isinstance(value, list) and bool(value) and all(map(POSITIVE[0], value)),
@@ -65,7 +72,10 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("world_seed", "seed"), (_is_index, "must be a whole number, not negative")),
     "ring": (lambda value: value is None or _is_index(value), "must be null or a whole number, not negative"),
     "max_turn_deg": (lambda value: _is_number(value) and value >= 0, "must be 0 or a positive number"),
-    "workers": (lambda value: value is None or _is_count(value), "must be null or a whole number above 0"),
+    **dict.fromkeys(
+        ("workers", "frames"),
+        (lambda value: value is None or _is_count(value), "must be null or a whole number above 0"),
+    ),
 }
 """What the last part of an option's name asks of its value."""
 
@@ -76,9 +86,12 @@ def plain(cfg: DictConfig) -> Settings:
     Raises:
         InputError: a value that the user must give is missing, or one has no meaning.
     """
-    for name, value in flat(OmegaConf.to_container(cfg)).items():  # type: ignore[arg-type]
+    given = flat(OmegaConf.to_container(cfg))  # type: ignore[arg-type]
+    for name, value in given.items():
         if value == "???":
             raise InputError(f"{name} is missing; give it on the command line, {name}=...")
+    # Before others are looked up by it, where Hydra would name those and not the mistake.
+    _check({name: value for name, value in given.items() if "${" not in str(value)})
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
@@ -88,11 +101,15 @@ def plain(cfg: DictConfig) -> Settings:
         if isinstance(data[split], list):  # where [10] is a number to Hydra, and [00] is not
             data[split] = [str(name) for name in data[split]]
     _name_paths(settings)
-    for name, value in flat(settings).items():
+    _check(flat(settings))
+    return settings
+
+
+def _check(values: Settings) -> None:
+    for name, value in values.items():
         is_valid, wanted = RULES.get(name.split(".")[-1], (bool, ""))
         if wanted and not is_valid(value):
             raise InputError(f"{name}={value}: {wanted}")
-    return settings
 
 
 def _name_paths(settings: Settings) -> None:

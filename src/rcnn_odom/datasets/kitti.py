@@ -182,10 +182,12 @@ def _ring_elevations(scans: list[Path]) -> FloatArray:
         elevations.append([_median_elevation(ring) for ring in rings])
     usual = int(np.median([len(of_frame) for of_frame in elevations]))
     # In single frames a neighbour can be nearer to horizontal: the median over frames settles on one.
-    return np.median([of_frame[:usual] for of_frame in elevations if len(of_frame) >= usual], axis=0)
+    return np.nanmedian([of_frame[:usual] for of_frame in elevations if len(of_frame) >= usual], axis=0)
 
 
 def _median_elevation(points: Points) -> float:
+    if len(points) == 0:  # a frame without any return
+        return float("nan")
     x, y, z = points.T
     return float(np.median(np.arctan2(z, np.hypot(x, y))))
 

@@ -1,272 +1,238 @@
-"""Drives through generated cities, seen by a 2D laser like one ring of an HDL-64.
+"""Drives through generated worlds, seen by a 2D laser: no download, and never the same world twice.
 
-The motion resembles KITTI's (10 Hz, about a metre a frame, slow turns at crossings); nothing else in
-the city moves. A name stands for a city and a drive of its own, so ``05`` is always the same drive,
-but it has nothing in common with KITTI's 05 except the name.
+``street`` is a car with one ring of an HDL-64 in a city, its motion like KITTI's; ``indoor`` is a robot with
+a level scanner in a building. A name stands for a world and a drive of its own, so ``05`` is always the same
+drive, but it has nothing in common with KITTI's 05 except its name and, in full scale, its length.
 """
 
 import hashlib
 import zlib
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
-from rcnn_odom.motion import FloatArray, planar_to_poses, wrap_angle
-from rcnn_odom.street import City, build_city, random_route
+from rcnn_odom.motion import FloatArray, planar_to_poses
+from rcnn_odom.scan import Sensor
+from rcnn_odom.simulation.building import plan_building
+from rcnn_odom.simulation.city import Roads, random_plan, random_warp
+from rcnn_odom.simulation.drive import FRAME_TIME, random_drive
+from rcnn_odom.simulation.laser import Laser, hdl64_ring, scanner
+from rcnn_odom.simulation.people import furnish
+from rcnn_odom.simulation.robot import random_walk
+from rcnn_odom.simulation.scene import NO_WALLS, Scene
+from rcnn_odom.simulation.street import SIGHT, build_streets
+from rcnn_odom.simulation.terrain import flat_ground, random_ground, stand
+from rcnn_odom.simulation.traffic import build_traffic
 
-VERSION = 2
+VERSION = 4
 """Counts changes of the generator: part of every fingerprint."""
 
-FRAME_TIME = 0.1
-SENSOR_AHEAD_OF_AXLE = 0.8
-PATH_STEP = 0.25
-WANDER = 0.3
-"""Metres by which the driver strays from the middle of the lane, at most."""
-WANTED_SPEED = (9.0, 13.5)
-MAX_ACCELERATION = 1.85
-MAX_LATERAL_ACCELERATION = 2.2
-CRAWL = 0.1
-"""Metres per second at a stop line: a speed of 0 would never leave it."""
+World = Literal["street", "indoor"]
+Scale = Literal["small", "full"]
 
-BEAMS = 2083
-MAX_RANGE = 80.0
-RANGE_NOISE = 0.02
-MISSING = 0.03
+KITTI_FRAMES = dict(
+    zip(
+        ("00", "01", "02", "03", "04", "05", "06", "07", "08", "09", "10"),
+        (4541, 1101, 4661, 801, 271, 2761, 1101, 1101, 4071, 1591, 1201),
+        strict=True,
+    )
+)
+SCORED_FRAMES = 700
+"""Of a small drive that validates or tests: well over 400 m, so that drift has segments of 100 to 400 m."""
+FRAMES: dict[str, dict[str, int]] = {
+    "full": KITTI_FRAMES,
+    "small": {name: frames // 10 for name, frames in KITTI_FRAMES.items()}
+    | dict.fromkeys(("05", "07", "10"), SCORED_FRAMES),
+}
+DEFAULT_FRAMES = 600
+"""Of a drive with another name."""
 
-_CITY, _ROUTE, _WANDER, _SPEED, _SCAN = range(5)
+SENSORS: dict[str, dict[str, Any]] = {
+    "street": {},
+    "indoor": {"resolution_deg": 1.0, "field_of_view_deg": 180.0, "max_range": 40.0},
+}
+"""What the lasers of the worlds are like unless the caller says otherwise: KITTI's, and a SICK's."""
+
+STRETCH = 20
+"""Frames for which what is in range is picked out together."""
+
+LASER_HEIGHT = 1.73
+MOUNTING_DEG, MOUNTING_HEIGHT = 0.2, 0.03
+"""Standard deviation of how the laser sits on this drive's car: pitch and roll, and metres."""
 
 
-def load(name: str, *, seed: int = 0, frames: int = 600) -> Sequence:
-    """A simulated drive: another city for every name and seed.
+def load(
+    name: str,
+    *,
+    sensor: Sensor | dict[str, Any] | None = None,
+    world: World = "street",
+    scale: Scale = "small",
+    frames: int | None = None,
+    seed: int = 0,
+    movers: bool = True,
+    missing: bool = True,
+    tilt: bool = True,
+) -> Sequence:
+    """A simulated drive: another world for every name and seed.
 
     Args:
-        name: any name; the same name and seed always give the same drive.
-        seed: chooses the set of cities, 0 or more.
-        frames: scans in the drive, at 10 Hz.
+        name: any name; the same name and seed always give the same drive. ``NAME~1``, ``NAME~2`` ... are
+            other drives in other worlds, each as long as ``NAME``.
+        sensor: field of view, range, and indoors the angle between beams; None: KITTI's, or a SICK's.
+        world: ``street`` or ``indoor``.
+        scale: ``full`` gives ``00`` to ``10`` as many frames as KITTI's, ``small`` a tenth of them.
+        frames: scans in the drive whatever its name; None: by scale and name.
+        seed: chooses the set of worlds, 0 or more.
+        movers: other cars and people move.
+        missing: some beams do not come back although there is something within range.
+        tilt: the car leans on its springs and the ground has slopes; without, the laser stays level, but
+            swings to the sides by the same millimetres.
 
     Returns:
         The drive. Its scans are computed when they are read.
 
     Raises:
-        InputError: fewer than two frames, or a negative seed.
+        InputError: fewer than two frames, a negative seed, an unknown world or scale, or too long a range.
     """
-    if frames < 2:
+    _check(name, world, scale, frames, seed)
+    length = frames or FRAMES[scale].get(name.split("~")[0], DEFAULT_FRAMES)
+    recipe = _Recipe(name, seed, world, length, movers, tilt)
+    sensor = Sensor(**(SENSORS[world] | (sensor or {}))) if not isinstance(sensor, Sensor) else sensor
+    if world == "street" and sensor.max_range > SIGHT:
         raise InputError(
-            f"simulated sequence {name}: a drive has at least 2 frames, not {frames}; change data.frames"
+            f"the simulated streets are drawn {SIGHT:g} m wide, so that data.sensor.max_range is at most that"
         )
-    if seed < 0:
-        raise InputError(
-            f"simulated sequence {name}: a seed is 0 or more, not {seed}; change data.world_seed"
-        )
-    city = build_city(_generator(seed, name, _CITY))
-    planar = _drive(city, frames, seed, name)
+    laser = hdl64_ring(sensor.max_range) if world == "street" else scanner(sensor)
+    reader = ScanReader(recipe, laser, missing)
     return Sequence(
         name=name,
-        poses=planar_to_poses(planar),
-        stamps=FRAME_TIME * np.arange(frames, dtype=np.float64),
-        read_scan=ScanReader(city.segments, city.returned, city.roughness, planar, seed, name),
-        fingerprint=hashlib.sha256(f"simulated {VERSION} {seed} {frames} {name}".encode()).hexdigest()[:16],
+        poses=_poses(recipe).copy(),
+        stamps=FRAME_TIME * np.arange(length, dtype=np.float64),
+        read_scan=reader,
+        fingerprint=hashlib.sha256(f"simulated {VERSION} {asdict(reader)}".encode()).hexdigest(),
     )
 
 
-def _generator(seed: int, name: str, *part: int) -> np.random.Generator:
-    """Independent random numbers for each part of a drive, the same in every process."""
-    return np.random.default_rng([seed, zlib.crc32(name.encode()), *part])
+def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> None:
+    wrong = None
+    if frames is not None and frames < 2:
+        wrong = f"a drive has at least 2 frames, not {frames}; change data.frames"
+    elif seed < 0:
+        wrong = f"a seed is 0 or more, not {seed}; change data.world_seed"
+    elif world not in ("street", "indoor"):
+        wrong = f"no world {world!r}; data.world is street or indoor"
+    elif scale not in FRAMES:
+        wrong = f"no scale {scale!r}; data.scale is small or full"
+    if wrong:
+        raise InputError(f"simulated sequence {name}: {wrong}")
 
 
-# --- the drive -----------------------------------------------------------------------------------
+@dataclass(frozen=True)
+class _Recipe:
+    """Everything that a world and the drive through it follow from."""
+
+    name: str
+    seed: int
+    world: str
+    frames: int
+    movers: bool
+    tilt: bool
+
+    def generator(self, *purpose: int) -> np.random.Generator:
+        """Independent random numbers for every seed, name and purpose."""
+        return np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), *purpose])
 
 
-def _drive(city: City, frames: int, seed: int, name: str) -> FloatArray:
-    """x, y and heading of the laser in every frame, (N, 3)."""
-    longest = frames * FRAME_TIME * WANTED_SPEED[1]
-    route, stops = random_route(city.plan, longest, _generator(seed, name, _ROUTE))
-    path, stop_lines = _smooth_path(city, route, stops, _generator(seed, name, _WANDER))
-    heading = np.unwrap(np.arctan2(*np.gradient(path, axis=0).T[::-1]))
-    travelled = _travel(heading, stop_lines, frames, _generator(seed, name, _SPEED))
-    along = PATH_STEP * np.arange(len(path), dtype=np.float64)
-    x, y, direction = (np.interp(travelled, along, values) for values in (*path.T, heading))
-    x += SENSOR_AHEAD_OF_AXLE * np.cos(direction)
-    y += SENSOR_AHEAD_OF_AXLE * np.sin(direction)
-    return np.stack([x, y, direction], axis=1)
-
-
-def _smooth_path(
-    city: City, route: FloatArray, stop_lines: list[int], rng: np.random.Generator
-) -> tuple[FloatArray, FloatArray]:
-    """The route in the bent city, as points (M, 2) every ``PATH_STEP`` metres, and stop lines in metres.
-
-    The steering wheel needs time to turn: the path is averaged over six metres. No driver keeps
-    exactly to the lane.
-    """
-    driven = _arc_length(route)
-    fine = np.arange(0, driven[-1], PATH_STEP)
-    bent = city.warp(np.stack([np.interp(fine, driven, values) for values in route.T], axis=1))
-    bent_driven = _arc_length(bent)
-    window = round(6 / PATH_STEP)
-    even = np.arange(0, bent_driven[-1], PATH_STEP)
-    box = np.ones(window) / window
-    path = np.stack(
-        [np.convolve(np.interp(even, bent_driven, values), box, mode="valid") for values in bent.T], axis=1
-    )
-    along = np.gradient(path, PATH_STEP, axis=0)
-    aside = WANDER * _meander(PATH_STEP * np.arange(len(path), dtype=np.float64), (25, 80), rng)
-    path += aside[:, None] * along @ np.array([[0.0, 1.0], [-1.0, 0.0]])
-    return path, np.interp(driven[stop_lines], fine, bent_driven) - window / 2 * PATH_STEP
-
-
-def _arc_length(points: FloatArray) -> FloatArray:
-    """Metres from the first of points (N, 2) to each along them, (N,)."""
-    return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
-
-
-def _travel(heading: FloatArray, stop_lines: FloatArray, frames: int, rng: np.random.Generator) -> FloatArray:
-    """Metres along the path in every frame, (frames,): slow in turns, waiting at some stop lines.
-
-    Args:
-        heading: (M,) radians at every step of the path.
-        stop_lines: (K,) metres along the path.
-    """
-    along = PATH_STEP * np.arange(len(heading), dtype=np.float64)
-    wanted = _wanted_speed(along, rng)
-    wait = _waits(len(heading), stop_lines, rng)
-    curvature = np.abs(np.gradient(heading, PATH_STEP))
-    limit = np.minimum(wanted, np.sqrt(MAX_LATERAL_ACCELERATION / (curvature + 1e-6)))
-    limit[wait > 0] = CRAWL
-    # The fastest drive below the limit is its lower envelope of slopes 2a in squared speed.
-    slope = 2 * MAX_ACCELERATION * along
-    squared = np.minimum.accumulate(limit**2 - slope) + slope
-    squared = np.minimum.accumulate((squared + slope)[::-1])[::-1] - slope
-    speed = np.sqrt(squared)
-    step_time = 2 * PATH_STEP / (speed[1:] + speed[:-1])
-    leave = wait + np.concatenate([[0.0], np.cumsum(step_time + wait[:-1])])
-    time = FRAME_TIME * np.arange(frames)
-    step = np.searchsorted(leave - wait, time, side="right") - 1
-    since = np.maximum(time - leave[step], 0)
-    acceleration = np.diff(squared)[step] / (2 * PATH_STEP)
-    return along[step] + speed[step] * since + acceleration * since**2 / 2
-
-
-def _wanted_speed(along: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Metres per second, (M,), rising and falling over some hundred metres."""
-    low, high = WANTED_SPEED
-    return (low + high) / 2 + (high - low) / 2 * _meander(along, (200, 800), rng)
-
-
-def _meander(along: FloatArray, lengths: tuple[float, float], rng: np.random.Generator) -> FloatArray:
-    """A slow random up and down between -1 and 1, (M,), of waves that are so many metres long."""
-    waves = 2 * np.pi / rng.uniform(*lengths, 3)
-    return np.sin(along[:, None] * waves + rng.uniform(0, 2 * np.pi, 3)).mean(axis=1)
-
-
-def _waits(steps: int, stop_lines: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Seconds of standing at every step of the path, (steps,): at most one stop in half a kilometre."""
-    wait = np.zeros(steps)
-    last = -rng.uniform(0, 500)
-    for line in stop_lines[stop_lines < PATH_STEP * (steps - 1)]:
-        stops, duration = rng.random() < 0.12, rng.uniform(1, 2.4)
-        if stops and line > max(last + 500, 20):
-            wait[int(line / PATH_STEP)] = duration
-            last = line
-    return wait
-
-
-# --- the laser -----------------------------------------------------------------------------------
+_PLAN, _DRIVE, _GROUND, _STANDING, _MOVING, _SCAN = range(6)
 
 
 @dataclass(frozen=True)
 class ScanReader:
-    """Looks at the city from the poses of a drive: the ``read_scan`` of a simulated sequence.
+    """Looks at a world from the poses of a drive: the ``read_scan`` of a simulated sequence.
 
-    Attributes:
-        segments: (S, 4) metres.
-        returned: (S,) chance that a beam on a segment comes back.
-        roughness: (S,) metres, standard deviation of the depth of a segment.
-        planar: (N, 3) x and y in metres and heading in radians of the laser.
-        seed: of the drive.
-        name: of the drive.
+    It holds the recipe only. The world is built by whichever process reads the first scan, and kept.
     """
 
-    segments: FloatArray
-    returned: FloatArray
-    roughness: FloatArray
-    planar: FloatArray
-    seed: int
-    name: str
+    recipe: _Recipe
+    laser: Laser
+    missing: bool
 
-    def __call__(self, index: int) -> tuple[FloatArray, FloatArray]:
-        """Angles in radians and ranges in metres, both (P,), of the beams that came back."""
-        index = range(len(self.planar))[index]
-        rng = _generator(self.seed, self.name, _SCAN, index)
-        angles = rng.uniform(-np.pi, np.pi) + np.linspace(0, 2 * np.pi, BEAMS, endpoint=False)
-        depth, segment = cast_rays(self.segments, self.planar[index], angles)
-        sigma = np.hypot(RANGE_NOISE, self.roughness[segment])
-        ranges = depth + sigma * rng.standard_normal(BEAMS)
-        chance = (1 - MISSING) * self.returned[segment]
-        back = (rng.random(BEAMS) < chance) & (ranges > 0) & (ranges < MAX_RANGE)
-        return wrap_angle(angles[back]), ranges[back]
+    def points(self, frame: int) -> npt.NDArray[np.float32]:
+        """(P, 4) x, y, z in metres in the laser's frame and reflectance 0: a KITTI file."""
+        frame = range(self.recipe.frames)[frame]
+        rng = self.recipe.generator(_SCAN, frame)
+        scene = _stretch(self.recipe, frame // STRETCH, self.laser.max_range)
+        return self.laser.look(scene, frame, _poses(self.recipe)[frame], rng, self.missing)
+
+    def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
+        """Angles in radians and horizontal ranges in metres, both (P,), of the beams that came back."""
+        x, y = self.points(frame)[:, :2].T.astype(np.float64)
+        return np.arctan2(y, x), np.hypot(x, y)
 
 
-def cast_rays(
-    segments: FloatArray, pose: FloatArray, angles: FloatArray
-) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Depth of the nearest segment along every beam, by a depth buffer over the beams.
-
-    Args:
-        segments: (S, 4) metres, in the world.
-        pose: (3,) x, y in metres and heading in radians of the laser in the world.
-        angles: (B,) radians from straight ahead: a full circle of evenly spaced beams.
-
-    Returns:
-        Depth (B,) in metres, inf where nothing is within ``MAX_RANGE``, and the segment (B,) that
-        was hit, meaningless where nothing was.
-    """
-    near = _near(segments, pose)
-    start, end = _seen_from(segments[near].reshape(-1, 2, 2), pose)
-    first, count = _beams_covered(start, end, angles)
-    owner = np.repeat(np.arange(len(near)), count)
-    position = np.arange(len(owner)) - np.repeat(np.cumsum(count) - count, count)
-    beam = (first[owner] + position) % len(angles)
-    along = end - start
-    across = start[:, 0] * along[:, 1] - start[:, 1] * along[:, 0]
-    slant = np.cos(angles)[beam] * along[owner, 1] - np.sin(angles)[beam] * along[owner, 0]
-    # A beam along a segment meets it at no single point; its neighbours at the end do the hiding.
-    with np.errstate(divide="ignore", invalid="ignore"):
-        depth = across[owner] / slant
-    depth = np.where((depth > 0) & (depth < MAX_RANGE), depth, np.inf)
-    nearest = np.full(len(angles), np.inf)
-    np.minimum.at(nearest, beam, depth)
-    hit = np.zeros(len(angles), dtype=np.int64)
-    wins = depth == nearest[beam]
-    hit[beam[wins]] = near[owner[wins]]
-    return nearest, hit
+def roads_of(drive: Sequence) -> Roads:
+    """What kind of roads a street drive goes along."""
+    assert isinstance(drive.read_scan, ScanReader)
+    return _street(drive.read_scan.recipe)[0].roads
 
 
-def _near(segments: FloatArray, pose: FloatArray) -> npt.NDArray[np.int64]:
-    """Indices of the segments of which any point can lie within range."""
-    x, y = (segments[:, 0] + segments[:, 2]) / 2 - pose[0], (segments[:, 1] + segments[:, 3]) / 2 - pose[1]
-    half = np.hypot(segments[:, 2] - segments[:, 0], segments[:, 3] - segments[:, 1]) / 2
-    return np.flatnonzero(x * x + y * y < (MAX_RANGE + half) ** 2)
+@lru_cache(maxsize=4)
+def _street(recipe: _Recipe) -> tuple:
+    """Plan, warp, ground, drive and the poses of its laser."""
+    rng = recipe.generator(_PLAN)
+    plan = random_plan(rng)
+    warp = random_warp(plan, rng)
+    drive = random_drive(plan, warp, recipe.frames, recipe.generator(_DRIVE))
+    rng = recipe.generator(_GROUND)
+    margin = 100.0
+    low, high = drive.path.min(0) - margin, drive.path.max(0) + margin
+    mounting = rng.normal(0, np.deg2rad(MOUNTING_DEG), 2)
+    height = LASER_HEIGHT + rng.normal(0, MOUNTING_HEIGHT)
+    if recipe.tilt:
+        ground = random_ground(low, high, rng)
+        poses = stand(drive.planar, drive.tilt + mounting, height, ground)
+    else:
+        ground = flat_ground(low, high)
+        poses = stand(drive.planar, np.zeros_like(drive.tilt), height, ground)
+    return plan, warp, ground, drive, poses
 
 
-def _seen_from(points: FloatArray, pose: FloatArray) -> tuple[FloatArray, FloatArray]:
-    """Both ends (S, 2) of segments (S, 2, 2) in the frame of a laser at ``pose``."""
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
-    seen = (points - pose[:2]) @ np.array([[cos, -sin], [sin, cos]])
-    return seen[:, 0], seen[:, 1]
+@lru_cache(maxsize=4)
+def _poses(recipe: _Recipe) -> FloatArray:
+    """Laser to world, (N, 4, 4)."""
+    if recipe.world == "street":
+        return _street(recipe)[-1]
+    building = plan_building(recipe.generator(_PLAN))
+    return planar_to_poses(random_walk(building, recipe.frames, recipe.generator(_DRIVE)))
 
 
-def _beams_covered(
-    start: FloatArray, end: FloatArray, angles: FloatArray
-) -> tuple[npt.NDArray[np.int64], npt.NDArray[np.int64]]:
-    """First beam and number of beams, (S,) each, within the angle that each segment covers."""
-    spacing = 2 * np.pi / len(angles)
-    azimuth = np.arctan2(start[:, 1], start[:, 0])
-    turn = wrap_angle(np.arctan2(end[:, 1], end[:, 0]) - azimuth)
-    begin = (azimuth + np.minimum(turn, 0) - angles[0]) / spacing
-    first = np.ceil(begin).astype(np.int64)
-    last = np.floor(begin + np.abs(turn) / spacing).astype(np.int64)
-    return first, np.maximum(last - first + 1, 0)
+@lru_cache(maxsize=2)
+def _stretch(recipe: _Recipe, number: int, max_range: float) -> Scene:
+    """The scene without what is out of range on a stretch of the drive: most of a city always is."""
+    scene = _scene(recipe)
+    driven = _poses(recipe)[number * STRETCH : (number + 1) * STRETCH, :2, 3]
+    middle = driven.mean(0)
+    reach = max_range + np.hypot(*(driven - middle).T).max()
+    x1, y1, x2, y2 = scene.standing.ends.T
+    half = np.hypot(x2 - x1, y2 - y1) / 2
+    away = np.hypot((x1 + x2) / 2 - middle[0], (y1 + y2) / 2 - middle[1])
+    return replace(scene, standing=scene.standing[away < reach + half])
+
+
+@lru_cache(maxsize=2)
+def _scene(recipe: _Recipe) -> Scene:
+    standing, moving = recipe.generator(_STANDING), recipe.generator(_MOVING)
+    if recipe.world == "indoor":
+        building = plan_building(recipe.generator(_PLAN))
+        planar = random_walk(building, recipe.frames, recipe.generator(_DRIVE))
+        return furnish(building, planar, standing, recipe.movers)
+    plan, warp, ground, drive, _ = _street(recipe)
+    walls = build_streets(plan, warp, ground, drive.path, standing)
+    if not recipe.movers:
+        return Scene(walls, NO_WALLS, np.zeros(recipe.frames + 1, dtype=np.int64), ground)
+    return Scene(walls, *build_traffic(plan, warp, ground, drive, moving), ground)

@@ -1,0 +1,82 @@
+"""Worlds without end: every epoch after the first trains on drives that nobody has seen before."""
+
+import logging
+import time
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import replace
+
+import numpy as np
+
+from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.scan import Sensor
+from rcnn_odom.workers import OpenDrive, Workers, useful_workers
+
+log = logging.getLogger(__name__)
+
+NICENESS = 10
+"""Training comes first: what it leaves of the processor makes worlds."""
+
+
+class FreshWorlds:
+    """The training drives of every epoch, made beside the epoch before and kept in memory alone.
+
+    Epoch 0 has the training set itself, epoch e the drive ``NAME~e`` in place of each NAME, as long as
+    it and whatever the number of workers or the epoch at which a stopped run goes on. There are never
+    more than two epochs of them in memory.
+
+    Args:
+        read: name -> ``Sequence``, picklable; a generator that takes any name.
+        drives: the training set.
+        epochs: of the training.
+        sensor: theirs.
+        workers: processes.
+    """
+
+    def __init__(
+        self, read: OpenDrive, drives: list[EncodedSequence], epochs: int, sensor: Sensor, workers: int
+    ) -> None:
+        self.read, self.drives, self.epochs, self.sensor = read, drives, epochs, sensor
+        self.worker_count = useful_workers(workers, sum(map(len, drives)))
+        self.waited = 0.0
+        """Seconds for which training stood still for the worlds of the present epoch."""
+        self._workers: Workers | None = None
+        # One thread: the workers make one epoch after the other.
+        self._maker = ThreadPoolExecutor(1)
+        self._made: dict[int, Future[list[EncodedSequence]]] = {}
+
+    def of(self, epoch: int) -> list[EncodedSequence]:
+        """The drives of an epoch, waiting for them if need be; those of the next are begun.
+
+        Raises:
+            InputError: a drive cannot be made.
+        """
+        wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
+        if wanted and self._workers is None:
+            log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
+            self._workers = Workers(self.worker_count, self.read, self.sensor, NICENESS)
+        self._made = {e: self._made.get(e) or self._maker.submit(self._make, e) for e in wanted}
+        start = time.monotonic()
+        drives = self._made[epoch].result() if epoch in self._made else self.drives
+        self.waited = time.monotonic() - start
+        return drives
+
+    def _make(self, epoch: int) -> list[EncodedSequence]:
+        assert self._workers is not None
+        names = [f"{drive.name}~{epoch}" for drive in self.drives]
+        scans = [np.empty(drive.scans.shape, np.float32) for drive in self.drives]
+        poses = [np.empty_like(drive.poses) for drive in self.drives]
+        lengths = [len(drive) for drive in self.drives]
+        for number, start, new_scans, new_poses in self._workers.encode(names, lengths):
+            stop = start + len(new_scans)
+            scans[number][start:stop], poses[number][start:stop] = new_scans, new_poses
+        return [
+            replace(drive, name=name, key=name, scans=its_scans, poses=its_poses)
+            for drive, name, its_scans, its_poses in zip(self.drives, names, scans, poses, strict=True)
+        ]
+
+    def close(self) -> None:
+        """Ends the workers at once and forgets their worlds."""
+        if self._workers is not None:
+            self._workers.close()
+        self._maker.shutdown(cancel_futures=True)
+        self._made.clear()

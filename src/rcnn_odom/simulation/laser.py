@@ -1,0 +1,121 @@
+"""Lasers that look at a scene: one ring of an HDL-64 on a car, or a robot's level scanner."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.motion import FloatArray
+from rcnn_odom.scan import Sensor
+from rcnn_odom.simulation.raycast import NO_WALL, cast
+from rcnn_odom.simulation.scene import Material, Scene
+
+GROUND = Material(returned=0.9, roughness=0.03)
+
+
+@dataclass(frozen=True)
+class Laser:
+    """A 2D laser.
+
+    Attributes:
+        step_deg: azimuth from one shot to the next.
+        half_steps: share of shots that follow after half of that; an HDL-64's encoder gives such.
+        field_of_view_deg: symmetric about straight ahead.
+        max_range: metres.
+        rise: metres of the beams' common origin above the laser's.
+        elevation_deg: of all beams. Both were fitted to the HDL-64's eighth ring in KITTI: its returns
+            lie on z = 0.206 m - 0.452 degrees times range to a millimetre, which is why the
+            elevation of a return, seen from the laser's origin, changes with its range.
+        noise: standard deviation of a range in metres.
+        reach: metres to which a wall that is hit squarely always answers; further off, and at a slant,
+            its chance falls with the power that comes back.
+        lost: chance that a shot is lost for no reason of the scene's.
+        trembling_deg: standard deviation of a shot's azimuth.
+    """
+
+    step_deg: float
+    half_steps: float = 0.0
+    field_of_view_deg: float = 360.0
+    max_range: float = 80.0
+    rise: float = 0.0
+    elevation_deg: float = 0.0
+    noise: float = 0.018
+    reach: float = 110.0
+    lost: float = 0.006
+    trembling_deg: float = 0.0
+
+    def look(
+        self, scene: Scene, frame: int, pose: FloatArray, rng: np.random.Generator, missing: bool = True
+    ) -> npt.NDArray[np.float32]:
+        """One revolution.
+
+        Args:
+            scene: what there is to see.
+            frame: when; moving things are where they are then.
+            pose: (4, 4) laser to world.
+            rng: gives noise, and decides which shots are lost.
+            missing: False: everything within range answers.
+
+        Returns:
+            (P, 4) x, y, z in metres in the laser's frame and reflectance 0, as an HDL-64 file has
+            them, by azimuth in [0, 2 pi).
+        """
+        azimuth = self._azimuths(rng)
+        rise = np.full_like(azimuth, np.tan(np.deg2rad(self.elevation_deg)))
+        own = np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1)
+        start = np.array([0.0, 0.0, self.rise])
+        walls, turn = scene.walls(frame), pose[:3, :3]
+        directions = own @ turn.T
+        depth, hit, squareness = cast(
+            walls, scene.ground, turn @ start + pose[:3, 3], directions, self.max_range
+        )
+        # HIT_GROUND and NO_WALL are the last but one and the last.
+        roughness = np.append(walls.roughness, [GROUND.roughness, 0.0])[hit]
+        ranges = depth / np.hypot(directions[:, 0], directions[:, 1])
+        ranges += np.hypot(self.noise, roughness) * rng.standard_normal(len(ranges))
+        luck = rng.random(len(ranges))
+        met = (hit != NO_WALL) & (ranges > 0.1) & (ranges < self.max_range)
+        if missing:
+            chance = np.append(walls.returned, [GROUND.returned, 0.0])[hit]
+            power = squareness * (self.reach / depth) ** 2
+            met &= luck < (1 - self.lost) * chance * np.minimum(1, power)
+        points = np.zeros((int(met.sum()), 4), dtype=np.float32)
+        points[:, :3] = start + ranges[met, None] * own[met]
+        return points
+
+    def _azimuths(self, rng: np.random.Generator) -> FloatArray:
+        """Radians of every shot, rising from 0 to 2 pi: where they drop, a Velodyne's next ring begins."""
+        step, view = self.step_deg, self.field_of_view_deg
+        if view < 360:
+            shots = round(view / step) + 1
+            azimuth = np.deg2rad(np.arange(shots) * step - view / 2)
+        else:
+            shots = int(360 / (step * (1 - self.half_steps / 2))) + 1
+            steps = np.where(rng.random(shots + 60) < self.half_steps, step / 2, step)
+            turned = rng.uniform(0, step) + np.cumsum(steps) - steps[0]
+            azimuth = np.deg2rad(turned[turned < 360])
+        if self.trembling_deg:
+            azimuth = azimuth + np.deg2rad(self.trembling_deg) * rng.standard_normal(len(azimuth))
+        return np.sort(azimuth % (2 * np.pi))
+
+
+def hdl64_ring(max_range: float) -> Laser:
+    """The ring of an HDL-64 that KITTI's loader takes; calibrated on real frames."""
+    return Laser(
+        step_deg=0.18,
+        half_steps=0.14,
+        max_range=max_range,
+        rise=0.206,
+        elevation_deg=-0.452,
+        trembling_deg=0.002,
+    )
+
+
+def scanner(sensor: Sensor) -> Laser:
+    """A robot's level laser with one beam for each bin, such as a SICK LMS."""
+    return Laser(
+        step_deg=sensor.resolution_deg,
+        field_of_view_deg=sensor.field_of_view_deg,
+        max_range=sensor.max_range,
+        noise=0.01,
+    )

@@ -1,0 +1,137 @@
+"""Where the beams of a laser end: a depth buffer over upright walls, then a march over the ground."""
+
+import numpy as np
+import numpy.typing as npt
+from numba import njit, vectorize
+
+from rcnn_odom.motion import FloatArray
+from rcnn_odom.simulation.scene import Walls
+from rcnn_odom.simulation.terrain import Ground, height_at
+
+NO_WALL = -1
+HIT_GROUND = -2
+_MARCH = 2.0
+"""Metres between two looks at the ground along a beam."""
+_CELLS = 4096
+"""Of the table by which the beams of an azimuth are found."""
+
+
+def cast(
+    walls: Walls, ground: Ground | None, origin: FloatArray, directions: FloatArray, max_range: float
+) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+    """The nearest thing that each beam meets.
+
+    Args:
+        walls: S upright rectangles, in the world.
+        ground: also in the world; None: nowhere.
+        origin: (3,) metres, where the beams start.
+        directions: (B, 3) of the beams in the world, none of them vertical.
+        max_range: metres in the horizontal plane.
+
+    Returns:
+        Horizontal depth (B,) in metres, inf where nothing is within ``max_range``; what was hit (B,): the
+        index of a wall, ``HIT_GROUND``, or ``NO_WALL``; and how squarely (B,), from 0 along a wall to 1.
+    """
+    turn = _turn(directions[:, 0], directions[:, 1])
+    order = np.argsort(turn)
+    level = np.hypot(directions[:, 0], directions[:, 1])
+    beams = np.stack([turn, *(directions / level[:, None]).T])[:, order]
+    depth, hit = _nearest_walls(walls.ends, walls.heights, origin, beams, max_range)
+    squareness = _squareness(walls.ends, hit, beams)
+    if ground is not None:
+        shape = ground.heights, ground.corner, ground.step, ground.steepest
+        _meet_ground(*shape, origin, beams, max_range, depth, hit, squareness)
+    back = np.empty_like(order)
+    back[order] = np.arange(len(order))
+    return depth[back], hit[back], squareness[back]
+
+
+@vectorize(cache=True)
+def _turn(x, y):  # type: ignore[no-untyped-def]
+    """Grows with the azimuth, from -2 to 2: all that sorting asks for, at a tenth of an arctangent's cost."""
+    share = y / (abs(x) + abs(y))
+    if x >= 0:
+        return share
+    return 2 - share if y >= 0 else -2 - share
+
+
+@njit(cache=True)
+def _first_beam(turns, table, turn):  # type: ignore[no-untyped-def]
+    """The first of the sorted beams that is not before a direction; the table saves the search."""
+    beam = table[int((turn + 2) * (_CELLS / 4))]
+    while beam > 0 and turns[beam - 1] >= turn:
+        beam -= 1
+    while beam < len(turns) and turns[beam] < turn:
+        beam += 1
+    return beam
+
+
+@njit(cache=True)
+def _nearest_walls(  # type: ignore[no-untyped-def]
+    ends, heights, origin, beams, max_range
+):
+    turns, east, north, slope = beams
+    depth = np.full(len(turns), np.inf)
+    hit = np.full(len(turns), NO_WALL)
+    table = np.searchsorted(turns, np.arange(_CELLS + 1) * (4 / _CELLS) - 2)
+    for wall in range(len(ends)):
+        x1, y1 = ends[wall, 0] - origin[0], ends[wall, 1] - origin[1]
+        x2, y2 = ends[wall, 2] - origin[0], ends[wall, 3] - origin[1]
+        across = x1 * y2 - y1 * x2  # 0: edge-on
+        reach = 2 * max_range + abs(x2 - x1) + abs(y2 - y1)
+        if across == 0 or (x1 + x2) ** 2 + (y1 + y2) ** 2 > reach**2:
+            continue
+        if across < 0:  # seen from its other side: counter-clockwise is from the first end to the second
+            x1, y1, x2, y2, across = x2, y2, x1, y1, -across
+        low, high = heights[wall, 0] - origin[2], heights[wall, 1] - origin[2]
+        first = _first_beam(turns, table, _turn(x1, y1))
+        stop = _first_beam(turns, table, _turn(x2, y2))
+        if y1 >= 0 > y2:  # the wall lies across the direction in which turns start again
+            stop += len(turns)
+        for position in range(first, stop):
+            beam = position % len(turns)
+            closing = east[beam] * (y2 - y1) - north[beam] * (x2 - x1)
+            if closing <= 0:  # along the wall: its neighbours at the end do the hiding
+                continue
+            distance = across / closing
+            if distance < depth[beam] and low <= slope[beam] * distance <= high:
+                depth[beam], hit[beam] = distance, wall
+    far = depth >= max_range
+    depth[far], hit[far] = np.inf, NO_WALL
+    return depth, hit
+
+
+@njit(cache=True)
+def _squareness(ends, hit, beams):  # type: ignore[no-untyped-def]
+    _, east, north, _ = beams
+    squareness = np.zeros(len(hit))
+    for beam in range(len(hit)):
+        if hit[beam] != NO_WALL:
+            x, y = ends[hit[beam], 2] - ends[hit[beam], 0], ends[hit[beam], 3] - ends[hit[beam], 1]
+            squareness[beam] = abs(east[beam] * y - north[beam] * x) / np.hypot(x, y)
+    return squareness
+
+
+@njit(cache=True)
+def _meet_ground(  # type: ignore[no-untyped-def]
+    heights, corner, step, steepest, origin, beams, max_range, depth, hit, squareness
+):
+    _, east, north, slope = beams
+    for beam in range(len(slope)):
+        above_before = origin[2] - height_at(heights, corner, step, origin[0], origin[1])
+        distance = 0.0
+        end = min(depth[beam], max_range)
+        closing = max(steepest - slope[beam], 1e-3)
+        while distance < end:
+            # So far there can be no ground, however it rises.
+            distance += _MARCH * max(1, int(above_before / (closing * _MARCH)))
+            x, y = origin[0] + east[beam] * distance, origin[1] + north[beam] * distance
+            above = origin[2] + slope[beam] * distance - height_at(heights, corner, step, x, y)
+            if above < 0:
+                share = above_before / (above_before - above)
+                met = distance - (1 - share) * _MARCH
+                if met < end:
+                    depth[beam], hit[beam] = met, HIT_GROUND
+                    squareness[beam] = (above_before - above) / _MARCH
+                break
+            above_before = above

@@ -1,0 +1,45 @@
+"""A generator of drives that costs nothing; workers import it, and with it little else."""
+
+import time
+from dataclasses import dataclass
+from zlib import crc32
+
+import numpy as np
+
+from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import planar_to_poses
+
+FRAMES = {"00": 150, "02": 70, "10": 40, "05": 40}
+
+
+@dataclass(frozen=True)
+class Scans:
+    """Random scans of a drive; a broken one has none, and a slow one takes its time."""
+
+    name: str
+    seed: int
+    broken: str = ""
+    seconds: float = 0.0
+
+    def __call__(self, frame):
+        if self.name == self.broken and frame == 20:
+            raise InputError(f"{self.name}: frame 20 is damaged; copy it again")
+        time.sleep(self.seconds)
+        rng = np.random.default_rng([self.seed, crc32(self.name.encode()), frame])
+        return rng.uniform(-np.pi, np.pi, 100), rng.uniform(0, 50, 100)
+
+
+def read(name, seed=0, broken="", seconds=0.0, frames=None, **options):
+    """A drive for any name, as ``rcnn_odom.datasets.simulated.load``; ``NAME~K`` is as long as NAME."""
+    frames = frames or FRAMES[name.split("~")[0]]
+    steps = np.random.default_rng([seed, crc32(name.encode())]).uniform(
+        [0.5, -0.05], [1.5, 0.05], (frames, 2)
+    )
+    heading = np.cumsum(steps[:, 1])
+    planar = np.stack(
+        [np.cumsum(steps[:, 0] * np.cos(heading)), np.cumsum(steps[:, 0] * np.sin(heading)), heading], axis=1
+    )
+    stamps = np.arange(frames, dtype=np.float64)
+    scans = Scans(name, seed, broken, seconds)
+    return Sequence(name, planar_to_poses(planar), stamps, scans, fingerprint=f"{name} {seed} {frames}")
