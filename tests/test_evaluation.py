@@ -15,16 +15,15 @@ from rcnn_odom.evaluation import (
     frame_table,
     percent,
     planar_drift,
-    read_motions,
     score,
     score_all,
     smooth,
     stretch_errors,
     table,
-    write_motions,
 )
 from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
 from rcnn_odom.report import report_test
+from rcnn_odom.trajectory import read_motions, write_motions
 
 
 def drive(planar, name="drive", camera_from_laser=FORWARD_CAMERA):

@@ -19,6 +19,7 @@ from data.make_kitti import make_kitti
 from evaluate import evaluate
 from rcnn_odom import cli, experiment
 from rcnn_odom.errors import InputError
+from rcnn_odom.fresh import FreshWorlds
 from rcnn_odom.metrics.drift import travelled
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.runs import BEST, LAST, fingerprint
@@ -346,10 +347,21 @@ def test_stopped_run_on_fresh_worlds_goes_on_with_the_same_worlds(configure, tmp
     assert len(list((tmp_path / "outputs" / "cache").iterdir())) == 4, "the new worlds leave no file"
 
 
-def test_first_stage_has_fresh_worlds_too(configure, caplog):
-    caplog.set_level("INFO")
-    train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=2"))
-    assert caplog.text.count("new worlds for every epoch") == 2
+def test_no_stage_sees_the_new_worlds_of_the_other(configure, monkeypatch):
+    seen = []
+    of = FreshWorlds.of
+
+    def remember(self, epoch):
+        drives = of(self, epoch)
+        seen.append({drive.name for drive in drives})
+        return drives
+
+    monkeypatch.setattr(FreshWorlds, "of", remember)
+    train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=3"))
+    assert len(seen) == 5
+    new = [names for names in seen if all("~" in name for name in names)]
+    assert len(new) == 3, "each stage begins with the training set itself"
+    assert len(set.union(*new)) == sum(map(len, new))
 
 
 def test_first_stage_on_fixed_worlds_does_not_serve_for_fresh_ones(configure):

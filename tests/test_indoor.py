@@ -7,7 +7,7 @@ import pytest
 
 from rcnn_odom.motion import planar_to_poses, relative_motions
 from rcnn_odom.simulation.building import plan_building
-from rcnn_odom.simulation.people import furnish
+from rcnn_odom.simulation.people import populate
 from rcnn_odom.simulation.robot import random_walk
 from rcnn_odom.simulation.scene import NO_WALLS
 
@@ -20,7 +20,7 @@ def world(seed, frames=FRAMES, people=True):
     rng = np.random.default_rng(seed)
     building = plan_building(rng)
     planar = random_walk(building, frames, rng)
-    return planar, furnish(building, planar, rng, people)
+    return planar, populate(building, planar, rng, people)
 
 
 @pytest.fixture(scope="module")

@@ -135,6 +135,7 @@ class FreshSampler(WindowSampler):
     def set_epoch(self, epoch: int) -> None:
         """Lightning calls this before each epoch, of a resumed run as well."""
         super().set_epoch(epoch)
+        # Lightning tells only samplers of an epoch; the loader has no processes that would hold a copy.
         self.windows.sequences = self.worlds.of(epoch)
 
 
@@ -165,6 +166,7 @@ class OdometryDataModule(L.LightningDataModule):
         seed: of the order and the augmentation.
         fresh_epochs: of a training on new worlds in every epoch, where ``read`` makes a drive for any
             name: see :class:`rcnn_odom.fresh.FreshWorlds`. 0: every epoch sees the same drives.
+        fresh_first: where the numbers of those worlds begin.
     """
 
     def __init__(
@@ -182,6 +184,7 @@ class OdometryDataModule(L.LightningDataModule):
         workers: int | None = None,
         seed: int = 0,
         fresh_epochs: int = 0,
+        fresh_first: int = 0,
     ) -> None:
         super().__init__()
         self.read, self.sensor, self.cache_dir = read, sensor, Path(cache_dir)
@@ -190,7 +193,7 @@ class OdometryDataModule(L.LightningDataModule):
         self.max_turn_bins, self.mirror = round(max_turn_deg / sensor.resolution_deg), mirror
         self.workers = workers or os.cpu_count() or 1
         self.sequences: dict[str, list[EncodedSequence]] = {}
-        self.fresh_epochs = fresh_epochs
+        self.fresh_epochs, self.fresh_first = fresh_epochs, fresh_first
         self.worlds: FreshWorlds | None = None
 
     def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
@@ -219,7 +222,7 @@ class OdometryDataModule(L.LightningDataModule):
         for split in splits:
             if not self.names[split]:
                 raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
-        for name in self.names["train"]:
+        for name in self.names["train"] if "train" in splits else []:
             whole = parse_part(name)[0]
             if self.fresh_epochs and whole != name:
                 raise InputError(
@@ -257,7 +260,9 @@ class OdometryDataModule(L.LightningDataModule):
         sampler: WindowSampler
         if self.fresh_epochs:
             self.close()
-            self.worlds = FreshWorlds(self.read, sequences, self.fresh_epochs, self.sensor, self.workers)
+            self.worlds = FreshWorlds(
+                self.read, sequences, self.fresh_epochs, self.sensor, self.workers, self.fresh_first
+            )
             sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
         else:
             sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)

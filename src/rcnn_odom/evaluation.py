@@ -1,13 +1,11 @@
 """Scores of estimated motions: drift, its floor, and the errors of single frames; files of motions."""
 
-from collections.abc import Iterable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 
 from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import Drift, drift
 from rcnn_odom.motion import ApplyStep, FloatArray, change_frame, compose, wrap_angle
 
@@ -182,70 +180,3 @@ def frame_table(reports: Mapping[str, Report]) -> str:
         cells += [f"{report['end_m']:.3f}", percent(report["end_ratio"])]
         lines.append(method.ljust(label) + "".join(cell.rjust(width) for cell in cells))
     return "\n".join(lines)
-
-
-def write_motions(
-    path: str | Path, motions: FloatArray, truth: FloatArray, baselines: Mapping[str, FloatArray]
-) -> None:
-    """Write CSV with a line for each motion, under the number of its later scan, in full precision.
-
-    Args:
-        path: file to write.
-        motions: estimated, (N, 2) metres and radians.
-        truth: (N, 2).
-        baselines: (N, 2) by the name of the method, which goes before the names of its columns.
-    """
-    rows = np.column_stack([np.arange(1, len(truth) + 1), motions, truth, *baselines.values()])
-    formats = ["%d"] + ["%.17g"] * (rows.shape[1] - 1)
-    header = ",".join(_motion_columns(baselines))
-    np.savetxt(path, rows, fmt=formats, delimiter=",", header=header, comments="")
-
-
-def _motion_columns(baselines: Iterable[str]) -> list[str]:
-    prefixes = ["", "true_", *(f"{name}_" for name in baselines)]
-    return ["frame", *(prefix + unit for prefix in prefixes for unit in ("distance_m", "heading_rad"))]
-
-
-def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read what :func:`write_motions` wrote.
-
-    Returns:
-        The truth (N, 2), N >= 1, and motions (N, 2) by method, the first one called ``estimate``.
-
-    Raises:
-        InputError: the file cannot be read, has another header or no motion, or a line (which is named)
-            is not the next frame with a finite number in each column.
-    """
-    try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    header = lines[0].split(",") if lines else []
-    baselines = [name.removesuffix("_distance_m") for name in header[5::2]]
-    methods = ["estimate", "true", *baselines]
-    if header != _motion_columns(baselines) or len(set(methods)) < len(methods):
-        raise InputError(
-            f"{path}:1: the header must be {','.join(_motion_columns([]))}, then "
-            "METHOD_distance_m,METHOD_heading_rad for each other method, if any"
-        )
-    if len(lines) == 1:
-        raise InputError(f"{path}: has no motion under its header: give a file with one line a frame")
-    rows = [_parse_motions(line, frame, len(header), path) for frame, line in enumerate(lines[1:], start=1)]
-    columns = dict(zip(methods, np.split(np.array(rows), len(methods), axis=1), strict=True))
-    return columns.pop("true"), columns
-
-
-def _parse_motions(line: str, frame: int, columns: int, path: str | Path) -> list[float]:
-    where = f"{path}:{frame + 1}"
-    fields = line.split(",")
-    if len(fields) != columns:
-        raise InputError(f"{where}: found {len(fields)} fields where the header has {columns}")
-    try:
-        number, *motions = map(float, fields)
-    except ValueError as error:
-        raise InputError(f"{where}: not numbers: {error}") from error
-    if not np.isfinite(motions).all():
-        raise InputError(f"{where}: a motion must be finite, found nan or inf")
-    if number != frame:
-        raise InputError(f"{where}: frame {fields[0]} where {frame} comes: frames count 1, 2, 3, ...")
-    return motions

@@ -47,6 +47,8 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
         workers=data["workers"],
         seed=settings["seed"],
         fresh_epochs=model["epochs"] if data.get("fresh_worlds") else 0,
+        # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
+        fresh_first=model["first_stage"]["epochs"] if "first_stage" in model else 0,
         **data["augment"],
     )
 

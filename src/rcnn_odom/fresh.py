@@ -20,7 +20,7 @@ NICENESS = 10
 class FreshWorlds:
     """The training drives of every epoch, made beside the epoch before and kept in memory alone.
 
-    Epoch 0 has the training set itself, epoch e the drive ``NAME~e`` in place of each NAME, as long as
+    Epoch 0 has the training set itself, epoch e a drive ``NAME~e`` in place of each NAME, as long as
     it and whatever the number of workers or the epoch at which a stopped run goes on. There are never
     more than two epochs of them in memory.
 
@@ -30,12 +30,19 @@ class FreshWorlds:
         epochs: of the training.
         sensor: theirs.
         workers: processes.
+        first: epoch e has the drives ``NAME~(first + e)``: a second stage begins where the first one ended.
     """
 
     def __init__(
-        self, read: OpenDrive, drives: list[EncodedSequence], epochs: int, sensor: Sensor, workers: int
+        self,
+        read: OpenDrive,
+        drives: list[EncodedSequence],
+        epochs: int,
+        sensor: Sensor,
+        workers: int,
+        first: int = 0,
     ) -> None:
-        self.read, self.drives, self.epochs, self.sensor = read, drives, epochs, sensor
+        self.read, self.drives, self.epochs, self.sensor, self.first = read, drives, epochs, sensor, first
         self.worker_count = useful_workers(workers, sum(map(len, drives)))
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
@@ -62,7 +69,7 @@ class FreshWorlds:
 
     def _make(self, epoch: int) -> list[EncodedSequence]:
         assert self._workers is not None
-        names = [f"{drive.name}~{epoch}" for drive in self.drives]
+        names = [f"{drive.name}~{self.first + epoch}" for drive in self.drives]
         scans = [np.empty(drive.scans.shape, np.float32) for drive in self.drives]
         poses = [np.empty_like(drive.poses) for drive in self.drives]
         lengths = [len(drive) for drive in self.drives]

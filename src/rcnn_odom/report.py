@@ -10,12 +10,12 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table, write_motions
+from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
 from rcnn_odom.figures import motion_figure, trajectory_figure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
 from rcnn_odom.settings import Settings, flat
-from rcnn_odom.trajectory import write_kitti, write_tum
+from rcnn_odom.trajectory import write_kitti, write_motions, write_tum
 
 log = logging.getLogger(__name__)
 

@@ -7,6 +7,7 @@ import os
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import yaml
 
 from rcnn_odom.datamodule import OdometryDataModule
@@ -79,7 +80,7 @@ def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
     """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
     recordings = {
         split: [
-            (sequence.key, sequence.name, hashlib.sha256(sequence.poses.tobytes()).hexdigest())
+            (sequence.key, sequence.name, hashlib.sha256(np.round(sequence.poses, 6).tobytes()).hexdigest())
             for sequence in datamodule.sequences[split]
         ]
         for split in ("train", "val")

@@ -9,7 +9,8 @@ import hashlib
 import zlib
 from dataclasses import asdict, dataclass, replace
 from functools import lru_cache
-from typing import Any, Literal
+from importlib.metadata import version
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -18,19 +19,22 @@ from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, planar_to_poses
 from rcnn_odom.scan import Sensor
-from rcnn_odom.simulation.building import plan_building
-from rcnn_odom.simulation.city import Roads, random_plan, random_warp
-from rcnn_odom.simulation.drive import FRAME_TIME, random_drive
+from rcnn_odom.simulation.building import Building, plan_building
+from rcnn_odom.simulation.city import Plan, Roads, Warp, random_plan, random_warp
+from rcnn_odom.simulation.drive import FRAME_TIME, Drive, random_drive
 from rcnn_odom.simulation.laser import Laser, hdl64_ring, scanner
-from rcnn_odom.simulation.people import furnish
+from rcnn_odom.simulation.people import populate
 from rcnn_odom.simulation.robot import random_walk
 from rcnn_odom.simulation.scene import NO_WALLS, Scene
-from rcnn_odom.simulation.street import SIGHT, build_streets
-from rcnn_odom.simulation.terrain import flat_ground, random_ground, stand
+from rcnn_odom.simulation.street import build_streets
+from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground, stand
 from rcnn_odom.simulation.traffic import build_traffic
 
 VERSION = 4
 """Counts changes of the generator: part of every fingerprint."""
+
+LIBRARIES = [(name, version(name)) for name in ("numpy", "scipy", "numba")]
+"""Another version of these may draw other numbers from the same seed."""
 
 World = Literal["street", "indoor"]
 Scale = Literal["small", "full"]
@@ -42,7 +46,7 @@ KITTI_FRAMES = dict(
         strict=True,
     )
 )
-SCORED_FRAMES = 700
+SCORED_FRAMES = 800
 """Of a small drive that validates or tests: well over 400 m, so that drift has segments of 100 to 400 m."""
 FRAMES: dict[str, dict[str, int]] = {
     "full": KITTI_FRAMES,
@@ -61,6 +65,7 @@ SENSORS: dict[str, dict[str, Any]] = {
 STRETCH = 20
 """Frames for which what is in range is picked out together."""
 
+LONGEST_RANGE = 80.0
 LASER_HEIGHT = 1.73
 MOUNTING_DEG, MOUNTING_HEIGHT = 0.2, 0.03
 """Standard deviation of how the laser sits on this drive's car: pitch and roll, and metres."""
@@ -103,9 +108,10 @@ def load(
     length = frames or FRAMES[scale].get(name.split("~")[0], DEFAULT_FRAMES)
     recipe = _Recipe(name, seed, world, length, movers, tilt)
     sensor = Sensor(**(SENSORS[world] | (sensor or {}))) if not isinstance(sensor, Sensor) else sensor
-    if world == "street" and sensor.max_range > SIGHT:
+    if world == "street" and sensor.max_range > LONGEST_RANGE:
         raise InputError(
-            f"the simulated streets are drawn {SIGHT:g} m wide, so that data.sensor.max_range is at most that"
+            f"simulated sequence {name}: the streets are drawn for lasers that see {LONGEST_RANGE:g} m; "
+            f"lower data.sensor.max_range, {sensor.max_range:g}"
         )
     laser = hdl64_ring(sensor.max_range) if world == "street" else scanner(sensor)
     reader = ScanReader(recipe, laser, missing)
@@ -114,7 +120,7 @@ def load(
         poses=_poses(recipe).copy(),
         stamps=FRAME_TIME * np.arange(length, dtype=np.float64),
         read_scan=reader,
-        fingerprint=hashlib.sha256(f"simulated {VERSION} {asdict(reader)}".encode()).hexdigest(),
+        fingerprint=hashlib.sha256(f"simulated {VERSION} {LIBRARIES} {asdict(reader)}".encode()).hexdigest(),
     )
 
 
@@ -178,12 +184,19 @@ class ScanReader:
 def roads_of(drive: Sequence) -> Roads:
     """What kind of roads a street drive goes along."""
     assert isinstance(drive.read_scan, ScanReader)
-    return _street(drive.read_scan.recipe)[0].roads
+    return _street(drive.read_scan.recipe).plan.roads
+
+
+class _Street(NamedTuple):
+    plan: Plan
+    warp: Warp
+    ground: Ground
+    drive: Drive
+    poses: FloatArray
 
 
 @lru_cache(maxsize=4)
-def _street(recipe: _Recipe) -> tuple:
-    """Plan, warp, ground, drive and the poses of its laser."""
+def _street(recipe: _Recipe) -> _Street:
     rng = recipe.generator(_PLAN)
     plan = random_plan(rng)
     warp = random_warp(plan, rng)
@@ -199,16 +212,22 @@ def _street(recipe: _Recipe) -> tuple:
     else:
         ground = flat_ground(low, high)
         poses = stand(drive.planar, np.zeros_like(drive.tilt), height, ground)
-    return plan, warp, ground, drive, poses
+    return _Street(plan, warp, ground, drive, poses)
+
+
+@lru_cache(maxsize=4)
+def _indoor(recipe: _Recipe) -> tuple[Building, FloatArray]:
+    """A building and where in it the laser goes, (N, 3)."""
+    building = plan_building(recipe.generator(_PLAN))
+    return building, random_walk(building, recipe.frames, recipe.generator(_DRIVE))
 
 
 @lru_cache(maxsize=4)
 def _poses(recipe: _Recipe) -> FloatArray:
     """Laser to world, (N, 4, 4)."""
     if recipe.world == "street":
-        return _street(recipe)[-1]
-    building = plan_building(recipe.generator(_PLAN))
-    return planar_to_poses(random_walk(building, recipe.frames, recipe.generator(_DRIVE)))
+        return _street(recipe).poses
+    return planar_to_poses(_indoor(recipe)[1])
 
 
 @lru_cache(maxsize=2)
@@ -228,9 +247,7 @@ def _stretch(recipe: _Recipe, number: int, max_range: float) -> Scene:
 def _scene(recipe: _Recipe) -> Scene:
     standing, moving = recipe.generator(_STANDING), recipe.generator(_MOVING)
     if recipe.world == "indoor":
-        building = plan_building(recipe.generator(_PLAN))
-        planar = random_walk(building, recipe.frames, recipe.generator(_DRIVE))
-        return furnish(building, planar, standing, recipe.movers)
+        return populate(*_indoor(recipe), standing, recipe.movers)
     plan, warp, ground, drive, _ = _street(recipe)
     walls = build_streets(plan, warp, ground, drive.path, standing)
     if not recipe.movers:

@@ -1,23 +1,29 @@
-"""Real and simulated scans side by side: ``python -m rcnn_odom.simulation.calibration KITTI_ROOT``.
+"""Real and simulated scans side by side: ``python -m rcnn_odom.simulation.calibration DATA``.
 
 The real scans are one ring of the frames that the simulator was fitted to: sequence 00 of KITTI and frames 0
 to 19 of 90, a drive of KITTI's raw data whose frames 20 to 39 are kept for scoring. Both are streets of a
-town, so they are compared with the simulator's towns as well as with all of its worlds.
+town, so they are compared with the simulator's towns as well as with all of its worlds. The robots' logs are
+those whose buildings and ways the indoor world was made after.
 """
 
 import argparse
+import sys
 from collections.abc import Iterable
 from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from rcnn_odom.datasets import kitti, simulated
+from rcnn_odom.datasets import carmen, kitti, simulated
 from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.errors import InputError
+from rcnn_odom.motion import relative_motions
 from rcnn_odom.scan import Sensor, encode
 from rcnn_odom.simulation.city import RESIDENTIAL
 
 SENSOR = Sensor()
+ROBOT_SENSOR = Sensor(resolution_deg=1.0, field_of_view_deg=180.0, max_range=40.0)
+ROBOT_LOGS = ("mit-killian", "intel", "mit-csail")
 RUNS = (1, 2, 5, 20, 100, 3600)
 """Edges of the classes of run lengths, in bins of 0.1 degrees."""
 REAL_FRAMES = {"00": range(6), "90": range(20)}
@@ -36,19 +42,24 @@ def scan_figures(scans: Iterable[np.ndarray]) -> dict[str, float]:
     rows = []
     for scan in scans:
         circle = scan[:-1]
-        back = circle > 0
-        depth = circle[back]
-        row = {"filled": back.mean()}
-        for percentile in (10, 25, 50, 75, 90):
-            row[f"range p{percentile} (m)"] = np.percentile(depth, percentile)
-        lengths = empty_runs(back)
+        row, depth = _depth_figures(circle)
+        lengths = empty_runs(circle > 0)
         for low, high in pairwise(RUNS):
             inside = lengths[(lengths >= low) & (lengths < high)]
             row[f"empty in runs of {low}-{high - 1}"] = inside.sum() / len(circle)
         row["jumps > 0.5 m"] = (np.abs(np.diff(depth)) > 0.5).mean()
         row["jumps > 3 m"] = (np.abs(np.diff(depth)) > 3).mean()
         rows.append(row)
-    return {key: float(np.mean([row[key] for row in rows])) for key in rows[0]}
+    return _mean(rows)
+
+
+def _depth_figures(scan: np.ndarray) -> tuple[dict[str, float], np.ndarray]:
+    """What any laser's depth vector (bins,) has, and the depths of its returns."""
+    depth = scan[scan > 0]
+    row = {"filled": len(depth) / len(scan)}
+    for percentile in (10, 25, 50, 75, 90):
+        row[f"range p{percentile} (m)"] = float(np.percentile(depth, percentile))
+    return row, depth
 
 
 def empty_runs(back: np.ndarray) -> np.ndarray:
@@ -142,18 +153,63 @@ def _save_overlay(root: Path, path: Path) -> None:
     figure.savefig(path, dpi=60)
 
 
+def indoor_figures(sequence: Sequence, every: int) -> dict[str, float]:
+    """Figures of a robot's drive in a building: of its motion, and of every so many scans."""
+    distance, turn = _known_motions(sequence)
+    rows = []
+    for frame in range(0, len(sequence), every):
+        row, depth = _depth_figures(encode(*sequence.read_scan(frame), ROBOT_SENSOR))
+        jumps = np.abs(np.diff(depth))
+        rows.append(row | {f"jumps > {step} m": float((jumps > step).mean()) for step in (0.1, 0.5, 3)})
+    return {
+        "distance a scan, mean (m)": float(np.abs(distance).mean()),
+        "heading change a scan, mean (deg)": float(np.rad2deg(turn).mean()),
+        "heading change a scan, p99 (deg)": float(np.rad2deg(np.percentile(turn, 99))),
+        "standing": float(((np.abs(distance) < 0.01) & (turn < np.deg2rad(0.2))).mean()),
+        **_mean(rows),
+    }
+
+
+def _known_motions(sequence: Sequence) -> tuple[np.ndarray, np.ndarray]:
+    """Distances in metres and absolute heading changes in radians where the truth is known."""
+    distance, turn = relative_motions(sequence.poses).T
+    known = np.isfinite(distance)
+    return distance[known], np.abs(turn[known])
+
+
+def _indoor_columns(root: Path) -> dict[str, dict[str, float]]:
+    """Figures of the logs that the buildings were made after, and of simulated drives."""
+    columns = {}
+    for name in ROBOT_LOGS:
+        log = carmen.load(name, root=root, reference=root / "reference", max_range=ROBOT_SENSOR.max_range)
+        columns[name] = indoor_figures(log, every=50)
+    made = [simulated.load(f"calibration {n}", world="indoor", frames=400) for n in range(DRIVES)]
+    return columns | {"simulated": _mean([indoor_figures(drive, every=40) for drive in made])}
+
+
+def _print_table(columns: dict[str, dict[str, float]]) -> None:
+    print(f"| | {' | '.join(columns)} |\n| --- |{' ---: |' * len(columns)}")
+    for key in next(iter(columns.values())):
+        print(f"| {key} | {' | '.join(f'{column[key]:.3f}' for column in columns.values())} |")
+
+
 def main() -> None:
-    """Prints the table, and saves the overlay of real and simulated scans if asked to."""
+    """Prints tables of real and simulated figures; draws the scans if asked to."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("root", type=Path, help="folder with KITTI's sequences/ and poses/ of 00 and 90")
+    parser.add_argument("data", type=Path, help="folder with kitti/ (sequences 00 and 90) and carmen/ (logs)")
     parser.add_argument("--overlay", type=Path, metavar="FILE.png", help="draw scans here")
     arguments = parser.parse_args()
-    columns = list(real_figures(arguments.root).values()) + list(simulated_figures())
-    print("| | real 00 | real 90 | simulated towns | all simulated |\n| --- | --- | --- | --- | --- |")
-    for key in columns[0]:
-        print(f"| {key} | " + " | ".join(f"{column[key]:.3f}" for column in columns) + " |")
-    if arguments.overlay:
-        _save_overlay(arguments.root, arguments.overlay)
+    try:
+        real = real_figures(arguments.data / "kitti")
+        towns, everything = simulated_figures()
+        columns = {f"real {name}": figures for name, figures in real.items()}
+        _print_table(columns | {"simulated towns": towns, "all simulated": everything})
+        print()
+        _print_table(_indoor_columns(arguments.data / "carmen"))
+        if arguments.overlay:
+            _save_overlay(arguments.data / "kitti", arguments.overlay)
+    except InputError as error:
+        sys.exit(f"error: {error}")
 
 
 if __name__ == "__main__":

@@ -10,11 +10,11 @@ from rcnn_odom.simulation.scene import NO_WALLS, Scene
 ROOM_TO_WALK = 0.3
 PERSONAL_SPACE = 0.95
 """Metres from the laser that the middle of a person keeps."""
-SEEN_PEOPLE = 20.0
+SEEN_PEOPLE = 40.0
 """Metres within which people are part of a frame."""
 
 
-def furnish(building: Building, planar: FloatArray, rng: np.random.Generator, people: bool = True) -> Scene:
+def populate(building: Building, planar: FloatArray, rng: np.random.Generator, people: bool = True) -> Scene:
     """All that the laser meets on its way.
 
     Args:
