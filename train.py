@@ -27,8 +27,9 @@ def train(cfg: DictConfig) -> dict:
     settings = plain(cfg)
     run = Path(settings["run_dir"])
     trainer = experiment.build_trainer(settings, run)
+    datamodule = experiment.build_datamodule(settings)
     runs.start_run(run, settings)
-    datamodule = experiment.build_datamodule(settings).load()
+    datamodule.load()
     runs.point_latest(Path(settings["outputs"]), run)
     try:
         metrics = experiment.train_module(settings, datamodule, trainer)

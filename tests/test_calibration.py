@@ -5,15 +5,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcnn_odom.datasets.sequence import Sequence
-from rcnn_odom.motion import planar_to_poses
-from rcnn_odom.simulation.calibration import (
+from rcnn_odom.comparison.scans import (
     change_figures,
     empty_runs,
     real_figures,
     scan_figures,
     simulated_figures,
 )
+from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.motion import planar_to_poses
 
 KITTI = Path(__file__).parents[2] / "shared" / "data" / "kitti"
 
@@ -32,7 +32,7 @@ TOLERANCES = {
     "jumps > 3 m": 1.5,
 }
 """By what factor the simulated towns may leave the span of the two real recordings. Runs of 100 bins or more
-have no factor: one recording has none of them, so the share of the other is the bound."""
+have no factor, since one recording has none of them: the towns lie between the two."""
 
 
 def test_runs_go_round_the_circle() -> None:
@@ -81,7 +81,8 @@ def test_simulated_towns_look_like_the_real_ones() -> None:
     for key, factor in TOLERANCES.items():
         low, high = min(r[key] for r in real), max(r[key] for r in real)
         assert low / factor < towns[key] < high * factor, (key, low, towns[key], high)
-    assert towns["empty in runs of 100-3599"] < max(r["empty in runs of 100-3599"] for r in real)
+    long_runs = max(r["empty in runs of 100-3599"] for r in real)
+    assert 0.2 * long_runs < towns["empty in runs of 100-3599"] < long_runs
 
 
 def test_simulated_scans_change_like_the_real_ones() -> None:
@@ -92,3 +93,6 @@ def test_simulated_scans_change_like_the_real_ones() -> None:
     towns, _ = simulated_figures(drives=24, every=26)
     for key in ("change p25 (m)", "change p50 (m)", "change p75 (m)", "changed > 0.5 m"):
         assert real[key] / 2 < towns[key] < 1.5 * real[key], (key, towns[key], real[key])
+    assert towns["change p90 (m)"] < 2 * real["change p90 (m)"]
+    # One scan in a hundred more: the simulated laser loses single shots where 90's seems not to (00's does).
+    assert towns["vanished"] < real["vanished"] + 0.015

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from rcnn_odom.comparison.motion import real_recordings, simulated_recordings, statistics, table
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.simulation.city import KERB, Plan, Warp, random_plan, random_warp
-from rcnn_odom.simulation.drive import FRAME_TIME, PATH_STEP, Drive, random_drive
-from rcnn_odom.simulation.motion_table import real_recordings, simulated_recordings, statistics, table
+from rcnn_odom.simulation.drive import Drive, random_drive
+from rcnn_odom.simulation.line import PATH_STEP
+from rcnn_odom.simulation.speed import FRAME_TIME
 
 REAL = Path(__file__).resolve().parents[2] / "shared" / "data" / "kitti_gt_poses"
 SEEDS = 200

@@ -428,7 +428,8 @@ def test_small_training_set_has_more_epochs(options, epochs):
         ("data.world_seed=abc", "data.world_seed=abc: must be a whole number, not negative"),
         ("data.fresh_worlds=maybe", "data.fresh_worlds=maybe: must be true or false"),
         ("data.realism.tilt=1", "data.realism.tilt=1: must be true or false"),
-        ("data.realism=false", "data.realism=False: set its parts"),
+        ("data.sensor=3", "data.sensor=3: has parts to set, for instance data.sensor.max_range=40"),
+        ("data.realism=false", "data.realism=False: has parts to set"),
         ("data.passes.small.cnn=0", "data.passes.small.cnn=0: must be a whole number above 0"),
     ],
 )

@@ -12,14 +12,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from rcnn_odom.datasets import export, kitti
+from rcnn_odom.datasets import kitti
 from rcnn_odom.datasets.export import export_kitti
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import planar_to_poses, relative_motions
 from rcnn_odom.trajectory import read_kitti
+from rcnn_odom.workers import CHUNK
 
-FRAMES = export.CHUNK + 5
+FRAMES = CHUNK + 5
 EMPTY = 7
 """A frame in which nothing came back; not one of those of which `kitti.load` takes the elevation."""
 
@@ -29,9 +30,12 @@ class Reader:
     """Uneven azimuths and random ranges, in the order of the simulator's."""
 
     broken: int = -1
+    killing: int = -1
     slow: float = 0.0
 
     def points(self, frame):
+        if frame == self.killing:
+            os.kill(os.getpid(), signal.SIGKILL)
         if frame == self.broken:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         time.sleep(self.slow)
@@ -123,6 +127,12 @@ def test_does_not_overwrite_poses(tmp_path):
 def test_a_full_disk_leaves_nothing(tmp_path):
     with pytest.raises(InputError, match=r"sequence 00 cannot be written \(No space left on device\)"):
         export_kitti(make_sequence(broken=FRAMES - 1), tmp_path)
+    assert sorted(path.name for path in tmp_path.rglob("*")) == ["poses", "sequences"]
+
+
+def test_killed_worker_leaves_nothing(tmp_path):
+    with pytest.raises(InputError, match=r"was killed.*; free some and write sequence 00 again"):
+        export_kitti(make_sequence(killing=FRAMES - 1), tmp_path)
     assert sorted(path.name for path in tmp_path.rglob("*")) == ["poses", "sequences"]
 
 

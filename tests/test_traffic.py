@@ -8,8 +8,9 @@ from scipy.spatial import cKDTree
 
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.simulation.city import LANE_OFFSET, Plan, Warp, random_plan, random_warp
-from rcnn_odom.simulation.drive import FRAME_TIME, Drive, random_drive
+from rcnn_odom.simulation.drive import Drive, random_drive
 from rcnn_odom.simulation.scene import NO_WALLS, Scene
+from rcnn_odom.simulation.speed import FRAME_TIME
 from rcnn_odom.simulation.terrain import Ground, random_ground
 from rcnn_odom.simulation.traffic import CAR_SPEED, WALKER_SPEED, build_traffic
 

@@ -1,4 +1,4 @@
-"""How frames are dealt out to the processes that encode them."""
+"""How frames are dealt out to the processes that work on them."""
 
 import os
 import signal
@@ -10,6 +10,7 @@ from itertools import chain
 import numpy as np
 import pytest
 
+from rcnn_odom.cache import Encoding
 from rcnn_odom.errors import InputError
 from rcnn_odom.scan import Sensor, encode
 from rcnn_odom.workers import CHUNK, ONE_THREAD, Workers, share
@@ -41,15 +42,15 @@ def test_worlds_are_built_once_except_where_two_workers_meet():
 def encoded(workers):
     scans = [np.full((length, SENSOR.bins), np.nan, np.float32) for length in LENGTHS]
     poses = [np.full((length, 4, 4), np.nan) for length in LENGTHS]
-    for number, start, some_scans, some_poses in workers.encode(NAMES, LENGTHS):
-        scans[number][start : start + len(some_scans)] = some_scans
-        poses[number][start : start + len(some_scans)] = some_poses
+    for (number, start, stop), (some_scans, some_poses) in workers.run(NAMES, LENGTHS):
+        scans[number][start:stop] = some_scans
+        poses[number][start:stop] = some_poses
     return scans, poses
 
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_workers_give_what_direct_encoding_gives_as_often_as_asked(count):
-    with Workers(count, read, SENSOR) as workers:
+    with Workers(count, Encoding(read, SENSOR)) as workers:
         for _ in range(2):
             scans, poses = encoded(workers)
             for name, its_scans, its_poses in zip(NAMES, scans, poses, strict=True):
@@ -62,15 +63,12 @@ def test_workers_have_one_thread_each_and_no_ear_for_ctrl_c():
     """In a new process, where Python's own helper starts with the first worker and meddles."""
     script = """
 import os, signal
-from rcnn_odom.scan import Sensor
 from rcnn_odom.workers import Workers
 from test_workers import tell_environment
 before = dict(os.environ)
-with Workers(1, tell_environment, Sensor()) as workers:
-    try:
-        list(workers.encode(["00"], [1]))
-    except Exception as error:
-        print(error)
+with Workers(1, tell_environment) as workers:
+    [(piece, told)] = workers.run(["00"], [1])
+    print(told)
 assert dict(os.environ) == before
 assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
 """
@@ -86,13 +84,13 @@ assert not signal.pthread_sigmask(signal.SIG_BLOCK, [])
     assert done.stdout == f"{['1'] * len(ONE_THREAD)} True\n"
 
 
-def tell_environment(name):
+def tell_environment(name, start, stop):
     deaf = signal.SIGINT in signal.pthread_sigmask(signal.SIG_BLOCK, [])
-    raise InputError(f"{[os.environ[name] for name in ONE_THREAD]} {deaf}")
+    return f"{[os.environ[name] for name in ONE_THREAD]} {deaf}"
 
 
 def test_failure_of_a_reader_ends_the_workers_and_keeps_its_message():
-    workers = Workers(2, partial(read, broken="02"), SENSOR)
+    workers = Workers(2, Encoding(partial(read, broken="02"), SENSOR))
     with pytest.raises(InputError) as failure:
         encoded(workers)
     assert str(failure.value) == "02: frame 20 is damaged; copy it again"
@@ -100,13 +98,13 @@ def test_failure_of_a_reader_ends_the_workers_and_keeps_its_message():
     assert not any(process.is_alive() for process in workers._processes)
 
 
-@pytest.mark.parametrize("blocks_before", [0, 1])
-def test_killed_worker_is_told_of(blocks_before):
-    with Workers(2, partial(read, seconds=0.01), SENSOR) as workers:
-        blocks = workers.encode(NAMES, LENGTHS)
-        for _ in range(blocks_before):
-            next(blocks)
+@pytest.mark.parametrize("pieces_before", [0, 1])
+def test_killed_worker_is_told_of(pieces_before):
+    with Workers(2, Encoding(partial(read, seconds=0.01), SENSOR)) as workers:
+        pieces = workers.run(NAMES, LENGTHS)
+        for _ in range(pieces_before):
+            next(pieces)
         workers._processes[0].kill()
         workers._processes[0].join()
         with pytest.raises(InputError, match=r"was killed.*data\.workers=1"):
-            list(blocks)
+            list(pieces)

@@ -4,7 +4,9 @@ import hashlib
 import json
 import logging
 import os
+import re
 import time
+from collections.abc import Callable
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -18,7 +20,7 @@ from tqdm import tqdm
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame, relative_motions
-from rcnn_odom.scan import Sensor
+from rcnn_odom.scan import Sensor, encode
 from rcnn_odom.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
@@ -26,6 +28,32 @@ log = logging.getLogger(__name__)
 ENCODING_VERSION = 1
 """Raised whenever ``rcnn_odom.scan.encode`` gives other numbers for the same input."""
 DAY = 86400.0
+
+OpenDrive = Callable[[str], Sequence]
+Encoded = tuple[npt.NDArray[np.float32], FloatArray]
+"""Depth vectors (n, bins) and poses (n, 4, 4) of some frames of a drive."""
+
+
+class Encoding:
+    """A task for workers: reads frames of a drive and encodes them.
+
+    Args:
+        open_drive: name -> ``Sequence``, picklable.
+        sensor: what the depth vectors are like.
+    """
+
+    def __init__(self, open_drive: OpenDrive, sensor: Sensor) -> None:
+        self.open_drive, self.sensor = open_drive, sensor
+        self._opened: dict[str, Sequence] = {}
+
+    def __call__(self, name: str, start: int, stop: int) -> Encoded:
+        """Frames start..stop-1 of one drive."""
+        if name not in self._opened:
+            # One is enough: a worker's pieces of a drive follow each other.
+            self._opened = {name: self.open_drive(name)}
+        sequence = self._opened[name]
+        scans = np.stack([encode(*sequence.read_scan(frame), self.sensor) for frame in range(start, stop)])
+        return scans, sequence.poses[start:stop]
 
 
 @dataclass(frozen=True)
@@ -73,7 +101,8 @@ def cache_path(sequence: Sequence, sensor: Sensor, folder: Path) -> Path:
     """Where the encoded scans belong: the name holds a hash of everything that changes them."""
     parts = [ENCODING_VERSION, sensor.as_dict(), sequence.fingerprint, len(sequence)]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-    return folder / f"{sequence.name}-{key}.npy"
+    plain_name = re.sub(r"[^\w.~-]+", "_", sequence.name)
+    return folder / f"{plain_name}-{key}.npy"
 
 
 def encode_sequences(
@@ -134,13 +163,14 @@ def _encode_into(missing: dict[Path, Sequence], sensor: Sensor, workers: int) ->
     log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
     by_name = {path.name: sequence for path, sequence in missing.items()}
     with ExitStack() as stack:
-        pool = stack.enter_context(Workers(useful_workers(workers, total), by_name.__getitem__, sensor))
+        encoding = Encoding(by_name.__getitem__, sensor)
+        pool = stack.enter_context(Workers(useful_workers(workers, total), encoding))
         bar = stack.enter_context(tqdm(total=total, desc="encoding scans", unit="scan", disable=None))
         files = [
             stack.enter_context(_PartialFile(path, (length, sensor.bins)))
             for path, length in zip(missing, lengths, strict=True)
         ]
-        for number, start, scans, _ in pool.encode(list(by_name), lengths):
+        for (number, start, _), (scans, _) in pool.run(list(by_name), lengths):
             files[number].write(start, scans)
             bar.update(len(scans))
 

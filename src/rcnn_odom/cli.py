@@ -157,7 +157,7 @@ def _add_frames(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         "--frames",
         type=_parse_frames,
         metavar="FIRST:LAST",
-        help="only these, both included; a frame is the motion to the scan of this number (all, from 1)",
+        help="only these, both included, such as 20:39; a frame is the motion to the scan of its number",
     )
     parser.add_argument(
         "--apply",
@@ -165,7 +165,7 @@ def _add_frames(commands: "argparse._SubParsersAction[argparse.ArgumentParser]")
         default="end",
         help="where along its turn a step is taken (%(default)s)",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON: the end point's error as a ratio")
+    parser.add_argument("--json", action="store_true", help="print JSON; end_ratio is a ratio, not percent")
     parser.set_defaults(run=_run_frames)
 
 
@@ -211,7 +211,7 @@ def _add_simulate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]
     )
     add = parser.add_argument
     add("--out", type=Path, required=True, metavar="DIR", help="folder to write to, made where missing")
-    add("--layout", choices=["kitti"], default="kitti", help="of the files (%(default)s)")
+    add("--layout", choices=["kitti"], default="kitti", help="layout of the files (%(default)s)")
     add(
         "--sequence",
         nargs="+",
@@ -225,9 +225,26 @@ def _add_simulate(commands: "argparse._SubParsersAction[argparse.ArgumentParser]
         metavar="N",
         help="scans in each sequence, whatever its name and scale",
     )
-    add("--scale", choices=["small", "full"], default="small", help="full: 00 to 10 are as long as KITTI's")
-    add("--world", choices=["street", "indoor"], default="street", help="where it drives (%(default)s)")
-    add("--seed", type=_whole_number(0), default=0, metavar="S", help="other worlds (%(default)s)")
+    add(
+        "--scale",
+        choices=["small", "full"],
+        default="small",
+        help="full: 00 to 10 have as many scans as KITTI's; small: a tenth, 800 for 05, 07 and 10. "
+        "Other names have 600 (%(default)s)",
+    )
+    add(
+        "--world",
+        choices=["street", "indoor"],
+        default="street",
+        help="street: a car in a city; indoor: a robot with a 180-degree laser (%(default)s)",
+    )
+    add(
+        "--seed",
+        type=_whole_number(0),
+        default=0,
+        metavar="S",
+        help="another number gives other worlds (%(default)s)",
+    )
     add(
         "--without",
         action="append",
@@ -259,6 +276,8 @@ def _run_simulate(arguments: argparse.Namespace) -> int:
         export_kitti(sequence, root)
     tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
     command = f"python evaluate.py data=kitti {shlex.quote(f'data.root={root}')} {tests}"
+    for option, value in simulated.SENSORS[arguments.world].items():
+        command += f" data.sensor.{option}={value:g}"
     print(f"wrote {', '.join(names)} to {root}; score a trained network there: {command}")
     return 0
 

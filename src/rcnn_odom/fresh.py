@@ -7,9 +7,9 @@ from dataclasses import replace
 
 import numpy as np
 
-from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive
 from rcnn_odom.scan import Sensor
-from rcnn_odom.workers import OpenDrive, Workers, useful_workers
+from rcnn_odom.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
 
@@ -18,19 +18,19 @@ NICENESS = 10
 
 
 class FreshWorlds:
-    """The training drives of every epoch, made beside the epoch before and kept in memory alone.
+    """The training drives of every epoch of one stage, made beside the epoch before and kept in memory alone.
 
-    Epoch 0 has the training set itself, epoch e a drive ``NAME~e`` in place of each NAME, as long as
-    it and whatever the number of workers or the epoch at which a stopped run goes on. There are never
-    more than two epochs of them in memory.
+    Epoch 0 of a stage's training has the training set itself, epoch e a drive ``NAME~(first + e)`` in
+    place of each NAME, as long as it and whatever the number of workers or the epoch at which a stopped
+    run goes on. There are never more than two epochs of them in memory.
 
     Args:
         read: name -> ``Sequence``, picklable; a generator that takes any name.
         drives: the training set.
-        epochs: of the training.
+        epochs: of this stage's training.
         sensor: theirs.
         workers: processes.
-        first: epoch e has the drives ``NAME~(first + e)``: a second stage begins where the first one ended.
+        first: epochs of the stage before, so that a second stage has other worlds than the first one.
     """
 
     def __init__(
@@ -46,7 +46,7 @@ class FreshWorlds:
         self.worker_count = useful_workers(workers, sum(map(len, drives)))
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
-        self._workers: Workers | None = None
+        self._workers: Workers[Encoded] | None = None
         # One thread: the workers make one epoch after the other.
         self._maker = ThreadPoolExecutor(1)
         self._made: dict[int, Future[list[EncodedSequence]]] = {}
@@ -60,7 +60,7 @@ class FreshWorlds:
         wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
         if wanted and self._workers is None:
             log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
-            self._workers = Workers(self.worker_count, self.read, self.sensor, NICENESS)
+            self._workers = Workers(self.worker_count, Encoding(self.read, self.sensor), NICENESS)
         self._made = {e: self._made.get(e) or self._maker.submit(self._make, e) for e in wanted}
         start = time.monotonic()
         drives = self._made[epoch].result() if epoch in self._made else self.drives
@@ -73,8 +73,7 @@ class FreshWorlds:
         scans = [np.empty(drive.scans.shape, np.float32) for drive in self.drives]
         poses = [np.empty_like(drive.poses) for drive in self.drives]
         lengths = [len(drive) for drive in self.drives]
-        for number, start, new_scans, new_poses in self._workers.encode(names, lengths):
-            stop = start + len(new_scans)
+        for (number, start, stop), (new_scans, new_poses) in self._workers.run(names, lengths):
             scans[number][start:stop], poses[number][start:stop] = new_scans, new_poses
         return [
             replace(drive, name=name, key=name, scans=its_scans, poses=its_poses)

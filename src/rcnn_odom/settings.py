@@ -39,6 +39,12 @@ NAMES: Rule = (
     "must list sequences, each once, for instance [a,b]",
 )
 
+
+def _group(part: str) -> Rule:
+    """Of a name that only holds others: all of it at once would leave nothing to look its parts up in."""
+    return lambda value: False, f"has parts to set, for instance {part}"
+
+
 PATHS = ("root", "reference", "pretrained", "run", "run_dir", "outputs")
 """Options that may look like a number on the command line, ``data.root=2011``, and are a path."""
 
@@ -54,8 +60,6 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("resolution_deg", "field_of_view_deg", "max_range"), POSITIVE),
     **dict.fromkeys(("freeze", "mirror", "per_sample_norm"), FLAG),
     **dict.fromkeys(("fresh_worlds", "movers", "missing", "tilt"), FLAG),
-    # All of it at once would leave nothing to look its parts up in.
-    "realism": (lambda value: False, "set its parts: movers, missing, tilt"),
     "world": _one_of("street", "indoor"),
     "scale": _one_of("small", "full"),
     **dict.fromkeys(("train", "val", "test"), NAMES),
@@ -76,6 +80,12 @@ RULES: dict[str, Rule] = {
         ("workers", "frames"),
         (lambda value: value is None or _is_count(value), "must be null or a whole number above 0"),
     ),
+    "sensor": _group("data.sensor.max_range=40"),
+    "realism": _group("data.realism.tilt=false"),
+    "passes": _group("data.passes.small.cnn=20"),
+    "rotation_classes": _group("data.rotation_classes.count=56"),
+    "augment": _group("data.augment.mirror=true"),
+    "first_stage": _group("model.first_stage.epochs=20"),
 }
 """What the last part of an option's name asks of its value."""
 

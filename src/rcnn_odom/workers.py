@@ -1,4 +1,4 @@
-"""Processes that encode scans: for the cache, and beside training for worlds that it sees only once."""
+"""Processes that share the work on the frames of drives: to encode them, or to write them to files."""
 
 import math
 import os
@@ -7,19 +7,13 @@ import traceback
 from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
-from functools import lru_cache
 from itertools import pairwise
 from multiprocessing import get_context, resource_tracker
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
+from typing import Generic, TypeVar
 
-import numpy as np
-import numpy.typing as npt
-
-from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
-from rcnn_odom.motion import FloatArray
-from rcnn_odom.scan import Sensor, encode
 
 CHUNK = 64
 """Frames that a worker hands over at a time."""
@@ -28,11 +22,11 @@ ONE_THREAD = dict.fromkeys(
     ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS", "NUMBA_NUM_THREADS"), "1"
 )
 
-OpenDrive = Callable[[str], Sequence]
+Answer = TypeVar("Answer")
+Task = Callable[[str, int, int], Answer]
+"""What is to be done with a drive of this name from the first frame to the one before the last."""
 Piece = tuple[int, int, int]
 """Number of a drive, its first frame and the one after the last."""
-Block = tuple[int, int, npt.NDArray[np.float32], FloatArray]
-"""Number of a drive, first frame, and from there on depth vectors (n, bins) and poses (n, 4, 4)."""
 
 
 def share(lengths: list[int], workers: int) -> list[list[Piece]]:
@@ -57,38 +51,40 @@ def useful_workers(workers: int, frames: int) -> int:
     return min(workers, math.ceil(frames / CHUNK))
 
 
-class Workers:
-    """Processes that read and encode drives; what comes out does not depend on how many there are.
+class Workers(Generic[Answer]):
+    """Processes that do a task on pieces of drives, the same ones however many processes there are.
 
     They end at once when closed, and by themselves when this process is killed.
 
     Args:
         count: processes.
-        open_drive: name -> ``Sequence``, called in the workers, so picklable.
-        sensor: what the depth vectors are like.
+        task: what they do; it and its answers are pickled, and each worker keeps its own copy.
         niceness: by how much the workers give way to others, 0 to 19.
+        remedy: what the user can do when one is killed.
     """
 
-    def __init__(self, count: int, open_drive: OpenDrive, sensor: Sensor, niceness: int = 0) -> None:
+    def __init__(
+        self, count: int, task: Task[Answer], niceness: int = 0, remedy: str = "try data.workers=1"
+    ) -> None:
+        self._remedy = remedy
         # Fresh processes: a fork of one that has started torch's threads can hang.
         context = get_context("spawn")
         self._connections, self._processes = [], []
         with _what_workers_inherit():
             for _ in range(count):
                 ours, theirs = context.Pipe()
-                process = context.Process(
-                    target=_work, args=(theirs, open_drive, sensor, niceness), daemon=True
-                )
+                process = context.Process(target=_work, args=(theirs, task, niceness), daemon=True)
                 process.start()
                 theirs.close()  # so that the death of the worker is the end of the pipe
                 self._connections.append(ours)
                 self._processes.append(process)
 
-    def encode(self, names: list[str], lengths: list[int]) -> Iterator[Block]:
-        """All frames of the drives, in whatever order they get done.
+    def run(self, names: list[str], lengths: list[int]) -> Iterator[tuple[Piece, Answer]]:
+        """All pieces of the drives and the task's answers, in whatever order they get done.
 
         Raises:
-            InputError: a frame cannot be read, or a worker was killed.
+            InputError: a worker was killed.
+            Exception: whatever the task raised.
         """
         todo: dict[Connection, deque[Piece]] = {}
         try:
@@ -96,20 +92,36 @@ class Workers:
                 self._connections, share(lengths, len(self._connections)), strict=True
             ):
                 if pieces:
-                    with _telling_of_death():
+                    with self._telling_of_death():
                         connection.send([(names[number], start, stop) for number, start, stop in pieces])
                     todo[connection] = deque(pieces)
             while todo:
                 for ready in wait(list(todo)):
                     assert isinstance(ready, Connection)
-                    scans, poses = _receive(ready)
-                    number, start, _ = todo[ready].popleft()
+                    answer = self._receive(ready)
+                    piece = todo[ready].popleft()
                     if not todo[ready]:
                         del todo[ready]
-                    yield number, start, scans, poses
+                    yield piece, answer
         finally:
             if todo:  # what is still to come would be taken for the answer to the next call
                 self.close()
+
+    def _receive(self, connection: Connection) -> Answer:
+        with self._telling_of_death():
+            answer = connection.recv()
+        if isinstance(answer, Exception):
+            raise answer
+        return answer
+
+    @contextmanager
+    def _telling_of_death(self) -> Iterator[None]:
+        try:
+            yield
+        except (EOFError, OSError) as error:
+            raise InputError(
+                f"a worker process was killed, perhaps for want of memory; {self._remedy}"
+            ) from error
 
     def close(self) -> None:
         """Ends the workers in the middle of whatever they do."""
@@ -118,7 +130,7 @@ class Workers:
         for process in self._processes:
             process.join()
 
-    def __enter__(self) -> "Workers":
+    def __enter__(self) -> "Workers[Answer]":
         return self
 
     def __exit__(
@@ -147,42 +159,18 @@ def _what_workers_inherit() -> Iterator[None]:
                 os.environ[name] = value
 
 
-@contextmanager
-def _telling_of_death() -> Iterator[None]:
-    try:
-        yield
-    except (EOFError, OSError) as error:
-        raise InputError(
-            "a process that encodes scans was killed, perhaps for want of memory; try data.workers=1"
-        ) from error
-
-
-def _receive(connection: Connection) -> tuple[npt.NDArray[np.float32], FloatArray]:
-    with _telling_of_death():
-        answer = connection.recv()
-    if isinstance(answer, Exception):
-        raise answer
-    return answer
-
-
-def _work(connection: Connection, open_drive: OpenDrive, sensor: Sensor, niceness: int) -> None:
+def _work(connection: Connection, task: Task[Answer], niceness: int) -> None:
     """What a worker does until its parent ends."""
     os.nice(niceness)
-    # Pieces of a drive follow each other.
-    open_drive = lru_cache(1)(open_drive)
     with suppress(EOFError, OSError):  # the parent has ended
         while True:
-            for name, start, stop in connection.recv():
-                connection.send(_encode(open_drive, name, range(start, stop), sensor))
+            for piece in connection.recv():
+                connection.send(_answer(task, *piece))
 
 
-def _encode(
-    open_drive: OpenDrive, name: str, frames: range, sensor: Sensor
-) -> tuple[npt.NDArray[np.float32], FloatArray] | Exception:
+def _answer(task: Task[Answer], name: str, start: int, stop: int) -> Answer | Exception:
     try:
-        sequence = open_drive(name)
-        scans = np.stack([encode(*sequence.read_scan(frame), sensor) for frame in frames])
-        return scans, sequence.poses[frames.start : frames.stop]
+        return task(name, start, stop)
     except Exception as error:
         error.add_note(traceback.format_exc())  # a traceback does not travel
         return error

@@ -1,13 +1,7 @@
 """Writes a simulated sequence in KITTI's odometry layout, which `kitti.load` and other tools read."""
 
 import os
-import signal
-import threading
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from concurrent.futures.process import BrokenProcessPool
-from contextlib import contextmanager
-from multiprocessing import get_context, parent_process
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Protocol, runtime_checkable
@@ -20,10 +14,9 @@ from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame
 from rcnn_odom.trajectory import write_kitti
+from rcnn_odom.workers import Workers, useful_workers
 
 Points = npt.NDArray[np.float32]
-
-CHUNK = 32
 
 NO_RETURN = np.array([[np.nan, np.nan, np.nan, 0.0]], dtype=np.float32)
 """Stands for a frame in which no beam came back: a file of 0 bytes would pass for one cut off. Readers
@@ -70,10 +63,10 @@ def export_kitti(sequence: Sequence, root: Path) -> None:
     try:
         for place in ("sequences", "poses"):
             (root / place).mkdir(parents=True, exist_ok=True)
-        with TemporaryDirectory(dir=root, prefix=f".{sequence.name}.", suffix=".partial") as partial:
-            folder, poses = Path(partial, sequence.name), Path(partial, "poses.txt")
+        with TemporaryDirectory(dir=root, prefix=f".{sequence.name}.", suffix=".partial") as hidden:
+            folder, poses = Path(hidden, sequence.name), Path(hidden, "poses.txt")
             (folder / "velodyne").mkdir(parents=True)
-            _write_scans(sequence.name, reader, len(sequence), folder / "velodyne")
+            _write_scans(reader, sequence.name, len(sequence), Path(hidden))
             _write_calibration(folder / "calib.txt", sequence.camera_from_laser)
             np.savetxt(folder / "times.txt", sequence.stamps, fmt="%e")
             from_first = np.linalg.inv(sequence.poses[0]) @ sequence.poses
@@ -88,64 +81,22 @@ def export_kitti(sequence: Sequence, root: Path) -> None:
         ) from error
 
 
-def _write_scans(name: str, reader: PointReader, frames: int, folder: Path) -> None:
-    starts = range(0, frames, CHUNK)
-    stops = [min(start + CHUNK, frames) for start in starts]
-    pool = ProcessPoolExecutor(
-        min(os.cpu_count() or 1, len(starts)),
-        get_context("spawn"),
-        initializer=_start_worker,
-        initargs=(reader, folder),
-    )
-    with tqdm(total=frames, desc=f"simulating {name}", unit="scan", disable=None) as bar:
-        try:
-            with _ctrl_c_ignored():
-                blocks = pool.map(_write_frames, starts, stops)
-            for written in blocks:
-                bar.update(written)
-        except BrokenProcessPool as error:
-            raise InputError(
-                f"sequence {name}: a process was killed, perhaps for want of memory; free some and try again"
-            ) from error
-        finally:
-            pool.shutdown(cancel_futures=True)
+def _write_scans(reader: PointReader, name: str, frames: int, root: Path) -> None:
+    count = useful_workers(os.cpu_count() or 1, frames)
+    remedy = f"free some and write sequence {name} again"
+    with (
+        Workers(count, partial(_write_frames, reader, root), remedy=remedy) as workers,
+        tqdm(total=frames, desc=f"simulating {name}", unit="scan", disable=None) as bar,
+    ):
+        for (_, start, stop), _ in workers.run([name], [frames]):
+            bar.update(stop - start)
 
 
-@contextmanager
-def _ctrl_c_ignored() -> Iterator[None]:
-    """Processes started meanwhile never hear of Ctrl-C: it is the parent that ends them and tidies up."""
-    handler = signal.signal(signal.SIGINT, signal.SIG_IGN)
-    try:
-        yield
-    finally:
-        signal.signal(signal.SIGINT, handler)
-
-
-_work: tuple[PointReader, Path]
-"""In a worker process: what it writes, and where. Sent once, since a world can be large."""
-
-
-def _start_worker(reader: PointReader, folder: Path) -> None:
-    global _work
-    _work = reader, folder
-    threading.Thread(target=_end_with_parent, daemon=True).start()
-
-
-def _end_with_parent() -> None:
-    """A killed parent cannot tell its workers to end, and they would wait for it forever."""
-    parent = parent_process()
-    assert parent is not None
-    parent.join()
-    os._exit(1)
-
-
-def _write_frames(start: int, stop: int) -> int:
-    reader, folder = _work
+def _write_frames(reader: PointReader, root: Path, name: str, start: int, stop: int) -> None:
     for frame in range(start, stop):
         points = reader.points(frame)
         points = points if len(points) else NO_RETURN
-        (folder / f"{frame:06d}.bin").write_bytes(points.astype("<f4").tobytes())
-    return stop - start
+        (root / name / "velodyne" / f"{frame:06d}.bin").write_bytes(points.astype("<f4").tobytes())
 
 
 def _write_calibration(path: Path, camera_from_laser: FloatArray) -> None:

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
+from scipy.spatial import cKDTree
 
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
@@ -21,11 +22,12 @@ from rcnn_odom.motion import FloatArray, planar_to_poses
 from rcnn_odom.scan import Sensor
 from rcnn_odom.simulation.building import Building, plan_building
 from rcnn_odom.simulation.city import Plan, Roads, Warp, random_plan, random_warp
-from rcnn_odom.simulation.drive import FRAME_TIME, Drive, random_drive
+from rcnn_odom.simulation.drive import Drive, random_drive
 from rcnn_odom.simulation.laser import Laser, hdl64_ring, scanner
 from rcnn_odom.simulation.people import populate
 from rcnn_odom.simulation.robot import random_walk
 from rcnn_odom.simulation.scene import NO_WALLS, Scene
+from rcnn_odom.simulation.speed import FRAME_TIME
 from rcnn_odom.simulation.street import build_streets
 from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground, stand
 from rcnn_odom.simulation.traffic import build_traffic
@@ -233,14 +235,19 @@ def _poses(recipe: _Recipe) -> FloatArray:
 @lru_cache(maxsize=2)
 def _stretch(recipe: _Recipe, number: int, max_range: float) -> Scene:
     """The scene without what is out of range on a stretch of the drive: most of a city always is."""
-    scene = _scene(recipe)
+    scene, (middles, longest) = _scene(recipe), _places(recipe)
     driven = _poses(recipe)[number * STRETCH : (number + 1) * STRETCH, :2, 3]
-    middle = driven.mean(0)
-    reach = max_range + np.hypot(*(driven - middle).T).max()
-    x1, y1, x2, y2 = scene.standing.ends.T
-    half = np.hypot(x2 - x1, y2 - y1) / 2
-    away = np.hypot((x1 + x2) / 2 - middle[0], (y1 + y2) / 2 - middle[1])
-    return replace(scene, standing=scene.standing[away < reach + half])
+    centre = driven.mean(0)
+    reach = max_range + np.hypot(*(driven - centre).T).max() + longest / 2
+    near = middles.query_ball_point(centre, reach, return_sorted=True)
+    return replace(scene, standing=scene.standing[np.array(near, dtype=np.int64)])
+
+
+@lru_cache(maxsize=2)
+def _places(recipe: _Recipe) -> tuple[cKDTree, float]:
+    """The middles of the standing walls, to be looked up by place, and the longest one's metres."""
+    ends = _scene(recipe).standing.ends
+    return cKDTree((ends[:, :2] + ends[:, 2:]) / 2), float(np.hypot(*(ends[:, 2:] - ends[:, :2]).T).max())
 
 
 @lru_cache(maxsize=2)

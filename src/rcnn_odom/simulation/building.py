@@ -7,47 +7,16 @@ whole decimetres, so that the floor's map (a cell a decimetre) is exact about th
 from collections.abc import Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from typing import Literal
 
 import numpy as np
-import numpy.typing as npt
-from scipy import ndimage
 
 from rcnn_odom.motion import FloatArray
-from rcnn_odom.simulation.scene import Material, Walls, join
-
-CELL = 0.1
-"""Metres between the points of the floor's map."""
-ROOM_TO_DRIVE = 0.45
-"""Metres between the middle of a robot and the nearest wall, at least."""
+from rcnn_odom.simulation.drawing import GLASS, PLASTER, WOOD, Door, Drawing, Leaf, Room, as_walls
+from rcnn_odom.simulation.floor import CELL, Floor, map_floor
+from rcnn_odom.simulation.furniture import furnish_room
+from rcnn_odom.simulation.scene import Walls
 
 WALL_THICKNESS = 0.2
-HEIGHTS = (-1.0, 3.0)
-PLASTER = Material(1.0, 0.003)
-WOOD = Material(0.995, 0.005)
-GLASS = Material(0.6, 0.01)
-CLOTH = Material(0.99, 0.01)
-
-Leaf = Literal["open", "closed", "none"]
-
-
-@dataclass(frozen=True)
-class Floor:
-    """Where there is room on the floor.
-
-    Attributes:
-        clearance: (X, Y) metres to the nearest wall, at every corner of a grid of ``CELL`` that begins at
-            the origin; never more than the true distance.
-        reachable: (X, Y) where a robot can be, all of it from everywhere.
-    """
-
-    clearance: FloatArray
-    reachable: npt.NDArray[np.bool_]
-
-    def room_at(self, points: FloatArray) -> FloatArray:
-        """Metres to the nearest wall from points (..., 2); 0 outside of the building."""
-        cells = np.moveaxis(points, -1, 0) / CELL
-        return ndimage.map_coordinates(self.clearance, cells, order=1, mode="constant")
 
 
 @dataclass(frozen=True)
@@ -56,58 +25,6 @@ class Building:
 
     standing: Walls
     floor: Floor
-
-
-@dataclass(frozen=True)
-class Room:
-    """A rectangle between walls, a hall too: its lower left and upper right corner in metres."""
-
-    low: tuple[float, float]
-    high: tuple[float, float]
-
-    @property
-    def size(self) -> tuple[float, float]:
-        """Metres along x and along y."""
-        return self.high[0] - self.low[0], self.high[1] - self.low[1]
-
-
-@dataclass(frozen=True)
-class Door:
-    """An opening through a wall.
-
-    Attributes:
-        axis: 0 when one walks through it along x, 1 along y.
-        faces: where on that axis the wall begins and ends, that of the room the leaf opens into last.
-        middle: of the opening, on the other axis.
-        width: metres.
-        wall: where the wall begins and ends, on the other axis.
-        leaf: what can be seen of the door itself.
-    """
-
-    axis: int
-    faces: tuple[float, float]
-    middle: float
-    width: float
-    wall: tuple[float, float]
-    leaf: Leaf
-
-    @property
-    def place(self) -> tuple[float, float]:
-        """The middle of the opening."""
-        through = sum(self.faces) / 2
-        return (through, self.middle) if self.axis == 0 else (self.middle, through)
-
-
-@dataclass
-class Drawing:
-    """The building as far as it is drawn: lines (x, y, x, y) of every material, and free-standing things."""
-
-    lines: dict[Material, list[tuple[float, ...]]]
-    doors: list[Door]
-    boxes: list[tuple[float, float, float, float, float]]
-    """x, y, half the length, half the width and direction of furniture."""
-    legs: list[tuple[float, float, float, float, float]]
-    """The same of thin things: a cross of two lines each."""
 
 
 def plan_building(rng: np.random.Generator) -> Building:
@@ -122,8 +39,8 @@ def plan_building(rng: np.random.Generator) -> Building:
             rim = (i == 0, i == len(columns) - 1, j == 0, j == len(rows) - 1)
             _draw_block(drawing, _set_back((left, right, bottom, top), rim, rng), rim, rng)
     _draw_corridors(drawing, columns, rows, rng)
-    walls = _as_walls(drawing)
-    return Building(walls, _map_floor(walls, (columns[-1][1], rows[-1][1])))
+    walls = as_walls(drawing)
+    return Building(walls, map_floor(walls, (columns[-1][1], rows[-1][1])))
 
 
 def _blocks_and_corridors(sizes: FloatArray, rng: np.random.Generator) -> list[tuple[float, float]]:
@@ -171,7 +88,7 @@ def _draw_block(
         drawing.lines[PLASTER] += _outline(room, doors)
         if (rim[2] or rim[3]) and rng.random() < 0.35:
             drawing.lines[GLASS] += _windows(room, room.low[1] if rim[2] else room.high[1], rng)
-        _furnish_room(drawing, room, hall, rng)
+        furnish_room(drawing, room, hall, rng)
     for door in doors:
         _draw_door(drawing, door, rng)
     drawing.doors += doors
@@ -328,150 +245,3 @@ def _draw_at_side(
     x, y = (place, side) if along == 0 else (side, place)
     scale = rng.uniform(0.7, 1.3)
     drawing.boxes.append((x, y, half_length * scale, half_depth, along * np.pi / 2))
-
-
-# --- furniture -----------------------------------------------------------------------------------
-
-
-def _furnish_room(drawing: Drawing, room: Room, hall: bool, rng: np.random.Generator) -> None:
-    """More of everything in larger rooms; a hall is emptier and has pillars."""
-    area = room.size[0] * room.size[1]
-    if hall:
-        half = rng.uniform(0.15, 0.35)
-        for x in np.arange(room.low[0] + 3, room.high[0] - 2, rng.uniform(4, 7)):
-            drawing.boxes.append((x, room.low[1] + room.size[1] * 0.35, half, half, 0.0))
-            drawing.boxes.append((x, room.low[1] + room.size[1] * 0.7, half, half, 0.0))
-        area *= 0.4
-    crowded = rng.uniform(0.5, 1.3)
-    for _ in range(rng.poisson(crowded * (1 + area / 12))):
-        drawing.boxes.append(_at_wall(room, rng.uniform(0.3, 1.0), rng.uniform(0.15, 0.3), rng))
-    for _ in range(rng.poisson(crowded * area / 60)):
-        drawing.boxes.append(_at_wall(room, rng.uniform(0.7, 1.1), 0.42, rng))
-    for _ in range(rng.poisson(crowded * (0.5 + area / 14))):
-        _place_table(drawing, room, rng)
-    for _ in range(rng.poisson(crowded * (0.5 + area / 20))):
-        x, y = _anywhere(room, 0.4, rng)
-        drawing.boxes.append((x, y, rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3), rng.uniform(0, np.pi)))
-
-
-def _at_wall(
-    room: Room, half_length: float, half_depth: float, rng: np.random.Generator
-) -> tuple[float, float, float, float, float]:
-    """Something with its back to one of the four walls."""
-    along = int(rng.integers(2))
-    half_length = min(half_length, room.size[along] / 2 - 0.1)
-    place = [0.0, 0.0]
-    place[along] = rng.uniform(room.low[along] + half_length, room.high[along] - half_length)
-    gap = half_depth + rng.uniform(0, 0.05)
-    place[1 - along] = room.low[1 - along] + gap if rng.random() < 0.5 else room.high[1 - along] - gap
-    return place[0], place[1], half_length, half_depth, along * np.pi / 2
-
-
-def _anywhere(room: Room, gap: float, rng: np.random.Generator) -> tuple[float, float]:
-    return rng.uniform(room.low[0] + gap, room.high[0] - gap), rng.uniform(
-        room.low[1] + gap, room.high[1] - gap
-    )
-
-
-def _place_table(drawing: Drawing, room: Room, rng: np.random.Generator) -> None:
-    """A table on four legs or on two side panels, at a wall or not, and chairs on four legs each."""
-    half_length, half_depth = rng.uniform(0.5, 0.9), rng.uniform(0.3, 0.42)
-    if rng.random() < 0.6:
-        x, y, _, _, direction = _at_wall(room, half_length, half_depth, rng)
-    else:
-        x, y = _anywhere(room, 1.0, rng)
-        direction = rng.choice([0, np.pi / 2]) + rng.normal(0, 0.1)
-    if rng.random() < 0.5:
-        drawing.legs += _corners(x, y, half_length, half_depth, direction, 0.025)
-    else:
-        for side in (-half_length, half_length):
-            x_side, y_side = x + side * np.cos(direction), y + side * np.sin(direction)
-            drawing.boxes.append((x_side, y_side, 0.015, half_depth, direction))
-    for _ in range(rng.integers(3)):
-        turn = rng.uniform(0, 2 * np.pi)
-        x_chair, y_chair = x + 0.7 * np.cos(turn), y + 0.7 * np.sin(turn)
-        if (
-            room.low[0] + 0.3 < x_chair < room.high[0] - 0.3
-            and room.low[1] + 0.3 < y_chair < room.high[1] - 0.3
-        ):
-            drawing.legs += _corners(x_chair, y_chair, 0.2, 0.2, turn, 0.015)
-
-
-def _corners(
-    x: float, y: float, half_length: float, half_width: float, direction: float, half_leg: float
-) -> list[tuple[float, float, float, float, float]]:
-    """Legs at the corners of a table or chair."""
-    cos, sin = np.cos(direction), np.sin(direction)
-    return [
-        (x + u * cos - v * sin, y + u * sin + v * cos, half_leg, half_leg, direction)
-        for u in (-half_length, half_length)
-        for v in (-half_width, half_width)
-    ]
-
-
-def _as_walls(drawing: Drawing) -> Walls:
-    """All that was drawn, without the furniture that would stand in a doorway."""
-    boxes = _keep_doorways_free(np.array(drawing.boxes).reshape(-1, 5), drawing.doors)
-    legs = _keep_doorways_free(np.array(drawing.legs).reshape(-1, 5), drawing.doors)
-    walls = [upright(np.array(lines).reshape(-1, 4), material) for material, lines in drawing.lines.items()]
-    square = np.array([[-1, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]])
-    cross = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]])
-    return join([*walls, upright(_shapes(boxes, square), WOOD), upright(_shapes(legs, cross), WOOD)])
-
-
-def _keep_doorways_free(things: FloatArray, doors: Sequence[Door]) -> FloatArray:
-    places, halves = np.array([d.place for d in doors]), np.array([d.width / 2 for d in doors])
-    apart = np.linalg.norm(things[:, None, :2] - places, axis=2)
-    reach = np.hypot(things[:, 2], things[:, 3])
-    return things[(apart > reach[:, None] + halves + 0.5).all(axis=1)]
-
-
-def _shapes(things: FloatArray, corners: npt.NDArray) -> FloatArray:
-    """Lines (L * K, 4) of a shape of ``corners`` (L, 4), unit size, for each of ``things`` (K, 5)."""
-    x, y, half_length, half_width, direction = (column[:, None] for column in things.T)
-    ends = []
-    for end in (0, 2):
-        u, v = half_length * corners[:, end], half_width * corners[:, end + 1]
-        ends += [
-            x + u * np.cos(direction) - v * np.sin(direction),
-            y + u * np.sin(direction) + v * np.cos(direction),
-        ]
-    return np.stack(ends, axis=-1).reshape(-1, 4)
-
-
-def upright(ends: FloatArray, material: Material) -> Walls:
-    """Walls of one material over lines (S, 4) on the floor, as high as the laser looks."""
-    count = len(ends)
-    return Walls(
-        ends.astype(np.float64),
-        np.tile(HEIGHTS, (count, 1)),
-        np.full(count, material.returned),
-        np.full(count, material.roughness),
-    )
-
-
-def _map_floor(walls: Walls, far_corner: tuple[float, float]) -> Floor:
-    """The clearance everywhere, and the largest connected part where a robot fits."""
-    length = np.hypot(*(walls.ends[:, 2:] - walls.ends[:, :2]).T)
-    pieces = 1 + (length / (CELL / 2)).astype(int)
-    wall = np.repeat(np.arange(len(walls)), pieces + 1)
-    first = np.cumsum(pieces + 1) - pieces - 1
-    along = (np.arange(len(wall)) - first[wall]) / pieces[wall]
-    points = (walls.ends[wall, :2] + along[:, None] * (walls.ends[wall, 2:] - walls.ends[wall, :2])) / CELL
-    free = np.ones(np.ceil(np.array(far_corner) / CELL).astype(int) + 16, dtype=bool)
-    # All four corners around a point: whichever way one looks, the map's wall is not behind the true one.
-    low, high = np.floor(points + 1e-6).astype(int), np.ceil(points - 1e-6).astype(int)
-    for x in (low[:, 0], high[:, 0]):
-        for y in (low[:, 1], high[:, 1]):
-            free[x, y] = False
-    clearance = CELL * ndimage.distance_transform_edt(free)
-    parts, _ = ndimage.label(clearance >= ROOM_TO_DRIVE)
-    # The first part is the open country around the building: it holds the origin.
-    sizes = np.bincount(parts.ravel())
-    sizes[[0, parts[0, 0]]] = 0
-    return Floor(clearance, parts == sizes.argmax())
-
-
-def unit(direction: FloatArray) -> FloatArray:
-    """Unit vectors (..., 2) of directions (...) in radians."""
-    return np.stack([np.cos(direction), np.sin(direction)], axis=-1)

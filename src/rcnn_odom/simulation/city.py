@@ -2,7 +2,7 @@
 
 The streets are drawn on a straight grid, where blocks and their sides are easy to describe, and then bent by
 a smooth `Warp`: a little in a town, strongly in the country, where roads wind. A route is a drive through the
-plan, still to be bent and rounded (see ``drive.py``).
+plan, still to be bent and rounded (see ``line.py``).
 """
 
 from collections.abc import Iterator

@@ -23,9 +23,10 @@ class Laser:
         field_of_view_deg: symmetric about straight ahead.
         max_range: metres.
         rise: metres of the beams' common origin above the laser's.
-        elevation_deg: of all beams. Both were fitted to the HDL-64's eighth ring in KITTI: its returns
-            lie on z = 0.206 m - 0.452 degrees times range to a millimetre, which is why the
-            elevation of a return, seen from the laser's origin, changes with its range.
+        elevation_deg: of all beams. Both were fitted to the HDL-64's eighth ring in KITTI, in frames 0 to
+            5 of sequence 00 and 0 to 19 of 90: its returns lie on z = 0.206 m - 0.452 degrees times range
+            to a millimetre, which is why the elevation of a return, seen from the laser's origin,
+            changes with its range.
         noise: standard deviation of a range in metres.
         reach: metres to which a wall that is hit squarely always answers; further off, and at a slant,
             its chance falls with the power that comes back.

@@ -4,8 +4,13 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.motion import FloatArray
-from rcnn_odom.simulation.building import CLOTH, Building, Floor, unit, upright
-from rcnn_odom.simulation.scene import NO_WALLS, Scene
+from rcnn_odom.simulation.building import Building
+from rcnn_odom.simulation.drawing import upright
+from rcnn_odom.simulation.floor import Floor
+from rcnn_odom.simulation.polyline import unit
+from rcnn_odom.simulation.scene import NO_WALLS, Material, Scene
+
+CLOTH = Material(0.99, 0.01)
 
 ROOM_TO_WALK = 0.3
 PERSONAL_SPACE = 0.95

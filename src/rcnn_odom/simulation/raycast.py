@@ -32,10 +32,10 @@ def cast(
         Horizontal depth (B,) in metres, inf where nothing is within ``max_range``; what was hit (B,): the
         index of a wall, ``HIT_GROUND``, or ``NO_WALL``; and how squarely (B,), from 0 along a wall to 1.
     """
-    turn = _turn(directions[:, 0], directions[:, 1])
-    order = np.argsort(turn)
+    rank = _azimuth_rank(directions[:, 0], directions[:, 1])
+    order = np.argsort(rank)
     level = np.hypot(directions[:, 0], directions[:, 1])
-    beams = np.stack([turn, *(directions / level[:, None]).T])[:, order]
+    beams = np.stack([rank, *(directions / level[:, None]).T])[:, order]
     depth, hit = _nearest_walls(walls.ends, walls.heights, origin, beams, max_range)
     squareness = _squareness(walls.ends, hit, beams)
     if ground is not None:
@@ -47,7 +47,7 @@ def cast(
 
 
 @vectorize(cache=True)
-def _turn(x, y):  # type: ignore[no-untyped-def]
+def _azimuth_rank(x, y):  # type: ignore[no-untyped-def]
     """Grows with the azimuth, from -2 to 2: all that sorting asks for, at a tenth of an arctangent's cost."""
     share = y / (abs(x) + abs(y))
     if x >= 0:
@@ -56,12 +56,12 @@ def _turn(x, y):  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _first_beam(turns, table, turn):  # type: ignore[no-untyped-def]
+def _first_beam(ranks, table, rank):  # type: ignore[no-untyped-def]
     """The first of the sorted beams that is not before a direction; the table saves the search."""
-    beam = table[int((turn + 2) * (_CELLS / 4))]
-    while beam > 0 and turns[beam - 1] >= turn:
+    beam = table[int((rank + 2) * (_CELLS / 4))]
+    while beam > 0 and ranks[beam - 1] >= rank:
         beam -= 1
-    while beam < len(turns) and turns[beam] < turn:
+    while beam < len(ranks) and ranks[beam] < rank:
         beam += 1
     return beam
 
@@ -70,10 +70,10 @@ def _first_beam(turns, table, turn):  # type: ignore[no-untyped-def]
 def _nearest_walls(  # type: ignore[no-untyped-def]
     ends, heights, origin, beams, max_range
 ):
-    turns, east, north, slope = beams
-    depth = np.full(len(turns), np.inf)
-    hit = np.full(len(turns), NO_WALL)
-    table = np.searchsorted(turns, np.arange(_CELLS + 1) * (4 / _CELLS) - 2)
+    ranks, east, north, slope = beams
+    depth = np.full(len(ranks), np.inf)
+    hit = np.full(len(ranks), NO_WALL)
+    table = np.searchsorted(ranks, np.arange(_CELLS + 1) * (4 / _CELLS) - 2)
     for wall in range(len(ends)):
         x1, y1 = ends[wall, 0] - origin[0], ends[wall, 1] - origin[1]
         x2, y2 = ends[wall, 2] - origin[0], ends[wall, 3] - origin[1]
@@ -84,12 +84,12 @@ def _nearest_walls(  # type: ignore[no-untyped-def]
         if across < 0:  # seen from its other side: counter-clockwise is from the first end to the second
             x1, y1, x2, y2, across = x2, y2, x1, y1, -across
         low, high = heights[wall, 0] - origin[2], heights[wall, 1] - origin[2]
-        first = _first_beam(turns, table, _turn(x1, y1))
-        stop = _first_beam(turns, table, _turn(x2, y2))
-        if y1 >= 0 > y2:  # the wall lies across the direction in which turns start again
-            stop += len(turns)
+        first = _first_beam(ranks, table, _azimuth_rank(x1, y1))
+        stop = _first_beam(ranks, table, _azimuth_rank(x2, y2))
+        if y1 >= 0 > y2:  # the wall lies across the direction in which ranks start again
+            stop += len(ranks)
         for position in range(first, stop):
-            beam = position % len(turns)
+            beam = position % len(ranks)
             closing = east[beam] * (y2 - y1) - north[beam] * (x2 - x1)
             if closing <= 0:  # along the wall: its neighbours at the end do the hiding
                 continue
@@ -128,6 +128,8 @@ def _meet_ground(  # type: ignore[no-untyped-def]
             x, y = origin[0] + east[beam] * distance, origin[1] + north[beam] * distance
             above = origin[2] + slope[beam] * distance - height_at(heights, corner, step, x, y)
             if above < 0:
+                # The step was one _MARCH: a longer one cannot end below ground, since even the steepest
+                # would need all of it to rise to the beam.
                 share = above_before / (above_before - above)
                 met = distance - (1 - share) * _MARCH
                 if met < end:

@@ -7,7 +7,9 @@ from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
 from rcnn_odom.motion import FloatArray
-from rcnn_odom.simulation.building import CELL, ROOM_TO_DRIVE, Building, Floor, unit
+from rcnn_odom.simulation.building import Building
+from rcnn_odom.simulation.floor import CELL, ROOM_TO_DRIVE, Floor
+from rcnn_odom.simulation.polyline import arc_length, resample, unit
 
 LASER_AHEAD = 0.08
 """Metres between the middle of a robot and its laser, at most."""
@@ -61,13 +63,13 @@ def random_walk(building: Building, frames: int, rng: np.random.Generator) -> Fl
         x, y and heading of the laser in every frame, (N, 3), metres and radians (not wrapped).
     """
     robot = random_robot(rng)
-    roads = Roads.of(building.floor, rng)
-    course = np.array([[*roads.anywhere(rng), rng.uniform(-np.pi, np.pi)]])
+    ways = Ways.of(building.floor, rng)
+    course = np.array([[*ways.anywhere(rng), rng.uniform(-np.pi, np.pi)]])
     waits = np.array([rng.exponential(5)])
     clock = _frames_needed(course, waits, robot)
     instants = np.cumsum(_intervals(frames, rng))
     while clock[-1, 1] < instants[-1]:
-        path = roads.way(course[-1, :2], robot.errand, rng)
+        path = ways.way(course[-1, :2], robot.errand, rng)
         ahead = _follow(path, course[-1], building.floor, robot, rng)
         course = np.concatenate([course, ahead])
         waits = np.concatenate([waits, np.zeros(len(ahead))])
@@ -80,7 +82,7 @@ def random_walk(building: Building, frames: int, rng: np.random.Generator) -> Fl
 
 
 @dataclass(frozen=True)
-class Roads:
+class Ways:
     """Ways through a building on a grid of two decimetres; wide ones are liked better.
 
     Attributes:
@@ -92,8 +94,8 @@ class Roads:
     graph: sparse.csr_array
 
     @classmethod
-    def of(cls, floor: Floor, rng: np.random.Generator) -> "Roads":
-        """The roads of a floor; ``rng`` decides where this robot likes to drive."""
+    def of(cls, floor: Floor, rng: np.random.Generator) -> "Ways":
+        """The ways of a floor; ``rng`` decides where this robot likes to drive."""
         free, room = floor.reachable[::2, ::2], floor.clearance[::2, ::2]
         taste = rng.uniform(0.5, 2.0, np.array(free.shape) // 8 + 1).repeat(8, 0).repeat(8, 1)
         effort = (1 + 1.5 * np.clip(0.9 - room, 0, None)) * taste[: free.shape[0], : free.shape[1]]
@@ -177,9 +179,9 @@ def _straighten(path: FloatArray, floor: Floor) -> FloatArray:
 
 def _evenly(path: FloatArray) -> FloatArray:
     """Points about a decimetre apart along straight lines, both ends included."""
-    driven = np.concatenate([[0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
+    driven = arc_length(path)
     even = np.linspace(0, driven[-1], max(2, int(driven[-1] / CELL) + 1))
-    return np.stack([np.interp(even, driven, values) for values in path.T], axis=1)
+    return resample(path, driven, even)
 
 
 def _round_off(path: FloatArray, floor: Floor, rounds: int) -> FloatArray:

@@ -56,8 +56,7 @@ class Side:
         self, start: Corner, end: Corner, material: Material, top: float, bottom: float = BELOW_GROUND
     ) -> None:
         """Four walls between two opposite corners."""
-        (a, b), (c, d) = start, end
-        self.line([(a, b), (c, b), (c, d), (a, d), (a, b)], material, top, bottom)
+        self.line(rectangle(start, end), material, top, bottom)
 
     def post(self, along: float, inward: float, radius: float, material: Material, top: float) -> None:
         """A five-sided post."""
@@ -274,6 +273,12 @@ class Side:
             along += spacing * self.rng.uniform(0.7, 1.3)
 
 
+def rectangle(start: Corner, end: Corner) -> list[Corner]:
+    """Its corners from one of two opposite ones round to the same again."""
+    (a, b), (c, d) = start, end
+    return [(a, b), (c, b), (c, d), (a, d), (a, b)]
+
+
 def car_size(rng: np.random.Generator) -> tuple[float, float]:
     """Length and height in metres of some car: mostly lower than the laser, now and then a van or lorry."""
     kind = rng.random()
@@ -294,9 +299,9 @@ def car_outline(length: float, height: float) -> list[tuple[tuple[float, float, 
     return [((0.0, -0.9, length, 0.9), 0.62 * height), (cabin, height)]
 
 
-Drawing = Callable[[Side], None]
+Filling = Callable[[Side], None]
 
-LINED_WITH: dict[Roads, dict[Drawing, float]] = {
+LINED_WITH: dict[Roads, dict[Filling, float]] = {
     RESIDENTIAL: {Side.suburb: 0.45, Side.town: 0.3, Side.estate: 0.15, Side.wood: 0.1},
     COUNTRY: {Side.wood: 0.45, Side.suburb: 0.3, Side.field: 0.15, Side.estate: 0.1},
     MAIN: {Side.wood: 0.35, Side.estate: 0.3, Side.field: 0.15, Side.town: 0.2},
@@ -308,7 +313,7 @@ def build_streets(
     plan: Plan, warp: Warp, ground: Ground, driven: FloatArray, rng: np.random.Generator
 ) -> Walls:
     """Everything that stands within sight of a driven line (M, 2), in world coordinates."""
-    drawings, shares = zip(*LINED_WITH[plan.roads].items(), strict=True)
+    fillings, shares = zip(*LINED_WITH[plan.roads].items(), strict=True)
     line = cKDTree(driven[::20])
     ends, surfaces = [], []
     for low, high in plan.blocks():
@@ -319,7 +324,7 @@ def build_streets(
         for corner, along, inward in _sides(low, high):
             length, depth = float(np.hypot(*along)), float(np.hypot(*inward))
             side = Side(rng, length, depth)
-            drawings[rng.choice(len(drawings), p=shares)](side)
+            fillings[rng.choice(len(fillings), p=shares)](side)
             side.parked_cars()
             side.posts()
             rows = _in_pieces(np.concatenate(side.rows))

@@ -103,16 +103,16 @@ def stand(planar: FloatArray, tilt: FloatArray, height: float, ground: Ground) -
     pitch = tilt[:, 0] - np.arctan((ahead - behind) / WHEELBASE)
     roll = tilt[:, 1] + np.arctan((leftward - rightward) / TRACK)
     poses = np.tile(np.eye(4), (len(planar), 1, 1))
-    poses[:, :3, :3] = _turns(heading, 2) @ _turns(pitch, 1) @ _turns(roll, 0)
+    poses[:, :3, :3] = _rotations(heading, 2) @ _rotations(pitch, 1) @ _rotations(roll, 0)
     poses[:, :2, 3], poses[:, 2, 3] = middle, z + height
     return poses
 
 
-def _turns(angle: FloatArray, axis: int) -> FloatArray:
+def _rotations(angle: FloatArray, axis: int) -> FloatArray:
     """Rotation matrices (N, 3, 3) by angles (N,) in radians about one of the axes."""
-    turns = np.tile(np.eye(3), (len(angle), 1, 1))
+    rotations = np.tile(np.eye(3), (len(angle), 1, 1))
     a, b = (axis + 1) % 3, (axis + 2) % 3
-    turns[:, a, a] = turns[:, b, b] = np.cos(angle)
-    turns[:, b, a] = np.sin(angle)
-    turns[:, a, b] = -turns[:, b, a]
-    return turns
+    rotations[:, a, a] = rotations[:, b, b] = np.cos(angle)
+    rotations[:, b, a] = np.sin(angle)
+    rotations[:, a, b] = -rotations[:, b, a]
+    return rotations

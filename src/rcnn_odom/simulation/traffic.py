@@ -8,9 +8,12 @@ import numpy.typing as npt
 
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.simulation.city import LANE_OFFSET, Plan, Warp
-from rcnn_odom.simulation.drive import FRAME_TIME, PATH_STEP, Drive
+from rcnn_odom.simulation.drive import Drive
+from rcnn_odom.simulation.line import PATH_STEP
+from rcnn_odom.simulation.polyline import resample
 from rcnn_odom.simulation.scene import Walls
-from rcnn_odom.simulation.street import BELOW_GROUND, PAINT, car_outline, car_size
+from rcnn_odom.simulation.speed import FRAME_TIME
+from rcnn_odom.simulation.street import BELOW_GROUND, PAINT, car_outline, car_size, rectangle
 from rcnn_odom.simulation.terrain import Ground
 
 SEEN = 85.0
@@ -129,9 +132,10 @@ def _same_lane(drive: Drive, rng: np.random.Generator, shapes: npt.NDArray[np.in
             gap = rng.uniform(20, 60) + rng.uniform(2, 8) * np.sin(during / rng.uniform(20, 80))
             where = (drive.along[during] + side * gap) / PATH_STEP
             there = (where > 0) & (where < len(drive.path) - 2)
-            x, y = (np.interp(where[there], np.arange(len(drive.path)), values) for values in drive.path.T)
+            numbers = np.arange(len(drive.path), dtype=np.float64)
+            middle = resample(drive.path, numbers, where[there])
             step = np.diff(drive.path, axis=0)[where[there].astype(int)]
-            pose = np.column_stack([x, y, np.arctan2(step[:, 1], step[:, 0])])
+            pose = np.column_stack([middle, np.arctan2(step[:, 1], step[:, 0])])
             yield _Movers(during[there], pose, np.full(len(pose), rng.choice(shapes)))
             start = stop + int(rng.exponential(200))
 
@@ -151,6 +155,6 @@ def _walker(rng: np.random.Generator) -> FloatArray:
 
 
 def _box(a: float, b: float, c: float, d: float, top: float) -> FloatArray:
-    corners = np.array([(a, b), (c, b), (c, d), (a, d), (a, b)])
+    corners = np.array(rectangle((a, b), (c, d)))
     rest = np.tile([BELOW_GROUND, top], (4, 1))
     return np.concatenate([corners[:-1], corners[1:], rest], axis=1)

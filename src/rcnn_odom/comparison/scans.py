@@ -1,4 +1,4 @@
-"""Real and simulated scans side by side: ``python -m rcnn_odom.simulation.calibration DATA``.
+"""Real and simulated scans side by side: ``python -m rcnn_odom.comparison.scans DATA``.
 
 The real scans are one ring of the frames that the simulator was fitted to: sequence 00 of KITTI and frames 0
 to 19 of 90, a drive of KITTI's raw data whose frames 20 to 39 are kept for scoring. Both are streets of a

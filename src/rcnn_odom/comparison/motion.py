@@ -1,6 +1,6 @@
 """How the simulator's motion compares with KITTI's: a table in Markdown.
 
-Run ``python -m rcnn_odom.simulation.motion_table POSES``, POSES being a folder with KITTI's ``00.txt`` and so
+Run ``python -m rcnn_odom.comparison.motion POSES``, POSES being a folder with KITTI's ``00.txt`` and so
 on and ``calib_00-02.txt``. Only the sequences that the simulator was made after are read.
 """
 
@@ -18,7 +18,8 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import drift
 from rcnn_odom.motion import FORWARD_CAMERA, FloatArray, change_frame, compose, relative_motions
 from rcnn_odom.simulation.city import random_plan, random_warp
-from rcnn_odom.simulation.drive import FRAME_TIME, random_drive
+from rcnn_odom.simulation.drive import random_drive
+from rcnn_odom.simulation.speed import FRAME_TIME
 from rcnn_odom.simulation.terrain import flat_ground, stand
 from rcnn_odom.trajectory import read_kitti
 

@@ -1,0 +1,1 @@
+"""Tables of how like the real recordings the simulated drives are."""
