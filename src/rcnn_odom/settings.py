@@ -59,7 +59,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("beta", "learning_rate", "width_deg", "regression", "classification"), POSITIVE),
     **dict.fromkeys(("resolution_deg", "field_of_view_deg", "max_range"), POSITIVE),
     **dict.fromkeys(("freeze", "mirror", "per_sample_norm"), FLAG),
-    **dict.fromkeys(("fresh_worlds", "movers", "missing", "tilt"), FLAG),
+    **dict.fromkeys(("fresh_worlds", "vary_pace", "movers", "missing", "tilt"), FLAG),
     "world": _one_of("street", "indoor"),
     "scale": _one_of("small", "full"),
     **dict.fromkeys(("train", "val", "test"), NAMES),

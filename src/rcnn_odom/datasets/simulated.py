@@ -22,7 +22,7 @@ from rcnn_odom.motion import FloatArray, planar_to_poses
 from rcnn_odom.scan import Sensor
 from rcnn_odom.simulation.building import Building, plan_building
 from rcnn_odom.simulation.city import Plan, Roads, Warp, random_plan, random_warp
-from rcnn_odom.simulation.drive import Drive, random_drive
+from rcnn_odom.simulation.drive import Drive, at_other_paces, random_drive
 from rcnn_odom.simulation.laser import Laser, hdl64_ring, scanner
 from rcnn_odom.simulation.people import populate
 from rcnn_odom.simulation.robot import random_walk
@@ -84,6 +84,7 @@ def load(
     movers: bool = True,
     missing: bool = True,
     tilt: bool = True,
+    vary_pace: bool = True,
 ) -> Sequence:
     """A simulated drive: another world for every name and seed.
 
@@ -99,6 +100,7 @@ def load(
         missing: some beams do not come back although there is something within range.
         tilt: the car leans on its springs and the ground has slopes; without, the laser stays level, but
             swings to the sides by the same millimetres.
+        vary_pace: a car drives the drives ``NAME~1`` ... faster and slower than KITTI's; ``NAME`` never.
 
     Returns:
         The drive. Its scans are computed when they are read.
@@ -108,7 +110,8 @@ def load(
     """
     _check(name, world, scale, frames, seed)
     length = frames or FRAMES[scale].get(name.split("~")[0], DEFAULT_FRAMES)
-    recipe = _Recipe(name, seed, world, length, movers, tilt)
+    other_paces = vary_pace and world == "street" and "~" in name
+    recipe = _Recipe(name, seed, world, length, movers, tilt, other_paces)
     sensor = Sensor(**(SENSORS[world] | (sensor or {}))) if not isinstance(sensor, Sensor) else sensor
     if world == "street" and sensor.max_range > LONGEST_RANGE:
         raise InputError(
@@ -150,6 +153,7 @@ class _Recipe:
     frames: int
     movers: bool
     tilt: bool
+    other_paces: bool
 
     def generator(self, *purpose: int) -> np.random.Generator:
         """Independent random numbers for every seed, name and purpose."""
@@ -202,7 +206,8 @@ def _street(recipe: _Recipe) -> _Street:
     rng = recipe.generator(_PLAN)
     plan = random_plan(rng)
     warp = random_warp(plan, rng)
-    drive = random_drive(plan, warp, recipe.frames, recipe.generator(_DRIVE))
+    drive_through = at_other_paces if recipe.other_paces else random_drive
+    drive = drive_through(plan, warp, recipe.frames, recipe.generator(_DRIVE))
     rng = recipe.generator(_GROUND)
     margin = 100.0
     low, high = drive.path.min(0) - margin, drive.path.max(0) + margin

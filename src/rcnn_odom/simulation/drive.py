@@ -5,7 +5,7 @@ KITTI's sequences 00 02 03 04 06 08 09, never from 05, 07 or 10;
 ``python -m rcnn_odom.comparison.motion`` compares the two.
 """
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -28,6 +28,10 @@ MOUNTING = (-0.002, 0.005)
 
 SWAY_HEIGHT = 1.2
 """Metres of the laser above the axis about which a car pitches and rolls: it moves with them."""
+
+PACE = (0.4, 1.6)
+PACE_FRAMES = 100
+"""By what factor a drive at another pace is slower or faster, and after how many frames that changes."""
 
 
 @dataclass(frozen=True)
@@ -90,3 +94,20 @@ def _laser(
     laser = axle + (lever + SWAY_HEIGHT * pitch)[:, None] * forward - (SWAY_HEIGHT * roll)[:, None] * left
     planar = np.concatenate([laser, faces[:, None] - mounting], axis=1)
     return planar, np.stack([pitch, roll], axis=1)
+
+
+def at_other_paces(plan: Plan, warp: Warp, frames: int, rng: np.random.Generator) -> Drive:
+    """A drive as of `random_drive` whose speed says less about its roads: half or one and a half times the usual.
+
+    Everything happens on the same roads in the same way, but faster or slower, and the pace changes
+    every some seconds. A network that learns from drives at KITTI's speeds alone guesses the speed
+    from what a street looks like, and measures little.
+    """
+    drive_rng, pace_rng = rng.spawn(2)
+    paces = pace_rng.uniform(*PACE, frames // PACE_FRAMES + 2)
+    pace = np.interp(np.arange(frames), PACE_FRAMES * np.arange(len(paces)), paces)
+    at = np.cumsum(pace)
+    usual = random_drive(plan, warp, int(at[-1]) + 2, drive_rng)
+    time = np.arange(len(usual.planar), dtype=np.float64)
+    planar, tilt = resample(usual.planar, time, at), resample(usual.tilt, time, at)
+    return replace(usual, planar=planar, tilt=tilt, along=np.interp(at, time, usual.along))
