@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from rcnn_odom.comparison.motion import real_recordings, simulated_recordings, statistics, table
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.simulation.city import KERB, Plan, Warp, random_plan, random_warp
-from rcnn_odom.simulation.drive import Drive, random_drive
+from rcnn_odom.simulation.drive import PACE, Drive, at_other_paces, random_drive
 from rcnn_odom.simulation.line import PATH_STEP
 from rcnn_odom.simulation.speed import FRAME_TIME
 
@@ -161,3 +161,23 @@ def test_table_has_a_row_for_every_figure() -> None:
         "| other | - | - |",
         "| large | 1234 | 1234 |",
     ]
+
+
+@pytest.mark.parametrize("frames", [2, 3, 700])
+def test_another_pace_is_the_same_drive_faster_and_slower(frames: int) -> None:
+    for seed in range(5):
+        plan, warp, _ = make(seed, 2)
+        other = at_other_paces(plan, warp, frames, np.random.default_rng(seed))
+        usual_rng, _ = np.random.default_rng(seed).spawn(2)
+        usual = random_drive(plan, warp, int(frames * PACE[1]) + 3, usual_rng)
+        assert len(other.planar) == len(other.tilt) == len(other.along) == frames
+        # Where the usual drive is at this place of its path, in frames: moving on by the pace.
+        moving = np.flatnonzero(np.diff(usual.along) > 0.01)
+        at = np.interp(other.along, usual.along[moving], moving)
+        step = np.diff(at)[np.diff(other.along) > 0.05]
+        assert np.percentile(step, 5, method="lower") > 0.9 * PACE[0] if len(step) else True
+        assert np.percentile(step, 95, method="higher") < 1.1 * PACE[1] if len(step) else True
+        if frames == 700:
+            assert np.ptp(step) > 0.5
+        distance, _ = cKDTree(usual.planar[:, :2]).query(other.planar[:, :2])
+        assert distance.max() < np.diff(usual.along).max()

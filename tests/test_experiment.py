@@ -404,9 +404,9 @@ def test_shipped_simulation_has_long_drives_to_score(configure, scale):
 @pytest.mark.parametrize(
     ("options", "epochs"),
     [
-        (["data=simulated"], [60, 25]),
+        (["data=simulated"], [50, 20]),
         (["data=simulated", "data.scale=full"], [10, 5]),
-        (["data=simulated", "data.passes.small.cnn=3"], [3, 25]),
+        (["data=simulated", "data.passes.small.cnn=3"], [3, 20]),
         (["data=kitti", "data.root=x"], [10, 5]),
         (["data=kitti", "data.root=x", "data.epochs.cnn=3"], [3, 5]),
     ],

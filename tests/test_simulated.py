@@ -161,6 +161,15 @@ def test_fresh_worlds_are_others_of_the_same_length(world: str) -> None:
     assert len(load("03~1", frames=7, world=world)) == 7
 
 
+def test_only_new_worlds_are_driven_at_other_paces() -> None:
+    for name, differs in (("03", False), ("03~1", True)):
+        usual, other = load(name, vary_pace=False), load(name)
+        assert np.array_equal(usual.poses, other.poses) != differs
+        assert (usual.fingerprint == other.fingerprint) != differs
+    indoors = [load("03~1", world="indoor", vary_pace=vary) for vary in (True, False)]
+    np.testing.assert_array_equal(indoors[0].poses, indoors[1].poses)
+
+
 def test_loading_is_cheap() -> None:
     load("00", scale="full", seed=90)  # compiles
     took = []

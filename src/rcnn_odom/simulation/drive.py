@@ -97,10 +97,10 @@ def _laser(
 
 
 def at_other_paces(plan: Plan, warp: Warp, frames: int, rng: np.random.Generator) -> Drive:
-    """A drive as of `random_drive` whose speed says less about its roads: half or one and a half times the usual.
+    """A drive whose speed says little about its roads: it is half or one and a half times the usual.
 
-    Everything happens on the same roads in the same way, but faster or slower, and the pace changes
-    every some seconds. A network that learns from drives at KITTI's speeds alone guesses the speed
+    Everything happens as in a drive of `random_drive`, but faster or slower, and the pace changes
+    every ten seconds. A network that learns from drives at KITTI's speeds alone guesses the speed
     from what a street looks like, and measures little.
     """
     drive_rng, pace_rng = rng.spawn(2)
