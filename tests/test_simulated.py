@@ -112,7 +112,7 @@ def test_names_seeds_and_worlds_are_different() -> None:
 
 @pytest.mark.parametrize("world", WORLDS)
 def test_fingerprint_changes_with_whatever_changes_scans(world: str) -> None:
-    shows = [{"seed": 1}, {"missing": False}, {"sensor": Sensor(0.5, 180.0, 20.0)}]
+    shows = [{"seed": 1}, {"missing": False}, {"sensor": Sensor(0.5, 180.0, 20.0).as_dict()}]
     shows += [{"movers": False}, {"tilt": False}] if world == "street" else []
     plain = load("05", world=world, frames=SHORT)
     for one in shows:
@@ -125,7 +125,11 @@ def test_fingerprint_changes_with_whatever_changes_scans(world: str) -> None:
 
 
 def test_sensor_is_given_whole_or_in_part_or_not_at_all() -> None:
-    for one in ({}, {"resolution_deg": 0.1, "field_of_view_deg": 360.0, "max_range": 80.0}, Sensor()):
+    for one in (
+        {},
+        {"resolution_deg": 0.1, "field_of_view_deg": 360.0, "max_range": 80.0},
+        Sensor().as_dict(),
+    ):
         assert load("05", frames=9, sensor=one).fingerprint == load("05", frames=9).fingerprint
     assert np.hypot(*load("05", frames=9, sensor={"max_range": 20.0}).read_scan.points(3)[:, :2].T).max() < 20
     angles, _ = load("05", frames=9, world="indoor", sensor={"field_of_view_deg": 90.0}).read_scan(3)

@@ -22,7 +22,7 @@ from rcnn_odom.scan import Sensor, encode
 from rcnn_odom.simulation.city import RESIDENTIAL
 
 SENSOR = Sensor()
-ROBOT_SENSOR = Sensor(resolution_deg=1.0, field_of_view_deg=180.0, max_range=40.0)
+ROBOT_SENSOR = Sensor(**simulated.SENSORS["indoor"])
 ROBOT_LOGS = ("mit-killian", "intel", "mit-csail")
 RUNS = (1, 2, 5, 20, 100, 3600)
 """Edges of the classes of run lengths, in bins of 0.1 degrees."""

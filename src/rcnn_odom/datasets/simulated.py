@@ -76,7 +76,7 @@ MOUNTING_DEG, MOUNTING_HEIGHT = 0.2, 0.03
 def load(
     name: str,
     *,
-    sensor: Sensor | dict[str, Any] | None = None,
+    sensor: dict[str, Any] | None = None,
     world: World = "street",
     scale: Scale = "small",
     frames: int | None = None,
@@ -91,15 +91,14 @@ def load(
     Args:
         name: any name; the same name and seed always give the same drive. ``NAME~1``, ``NAME~2`` ... are
             other drives in other worlds, each as long as ``NAME``.
-        sensor: field of view, range, and indoors the angle between beams; None: KITTI's, or a SICK's.
+        sensor: fields of :class:`rcnn_odom.scan.Sensor`; the others are KITTI's, or indoors a SICK's.
         world: ``street`` or ``indoor``.
-        scale: ``full`` gives ``00`` to ``10`` as many frames as KITTI's, ``small`` a tenth of them.
-        frames: scans in the drive whatever its name; None: by scale and name.
+        scale: by which ``FRAMES`` says how long the drive of a name is.
+        frames: its length whatever its name; None: by scale and name.
         seed: chooses the set of worlds, 0 or more.
         movers: other cars and people move.
         missing: some beams do not come back although there is something within range.
-        tilt: the car leans on its springs and the ground has slopes; without, the laser stays level, but
-            swings to the sides by the same millimetres.
+        tilt: the car leans on its springs and the ground has slopes; a level laser still sways sideways.
         vary_pace: a car drives the drives ``NAME~1`` ... faster and slower than KITTI's; ``NAME`` never.
 
     Returns:
@@ -112,14 +111,7 @@ def load(
     length = frames or FRAMES[scale].get(name.split("~")[0], DEFAULT_FRAMES)
     other_paces = vary_pace and world == "street" and "~" in name
     recipe = _Recipe(name, seed, world, length, movers, tilt, other_paces)
-    sensor = Sensor(**(SENSORS[world] | (sensor or {}))) if not isinstance(sensor, Sensor) else sensor
-    if world == "street" and sensor.max_range > LONGEST_RANGE:
-        raise InputError(
-            f"simulated sequence {name}: the streets are drawn for lasers that see {LONGEST_RANGE:g} m; "
-            f"lower data.sensor.max_range, {sensor.max_range:g}"
-        )
-    laser = hdl64_ring(sensor.max_range) if world == "street" else scanner(sensor)
-    reader = ScanReader(recipe, laser, missing)
+    reader = ScanReader(recipe, _laser(name, world, sensor or {}), missing)
     return Sequence(
         name=name,
         poses=_poses(recipe).copy(),
@@ -141,6 +133,18 @@ def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> 
         wrong = f"no scale {scale!r}; data.scale is small or full"
     if wrong:
         raise InputError(f"simulated sequence {name}: {wrong}")
+
+
+def _laser(name: str, world: str, given: dict[str, Any]) -> Laser:
+    sensor = Sensor(**SENSORS[world] | given)
+    if world == "indoor":
+        return scanner(sensor)
+    if sensor.max_range > LONGEST_RANGE:
+        raise InputError(
+            f"simulated sequence {name}: the streets are drawn for lasers that see {LONGEST_RANGE:g} m; "
+            f"lower data.sensor.max_range, {sensor.max_range:g}"
+        )
+    return hdl64_ring(sensor.max_range)
 
 
 @dataclass(frozen=True)
