@@ -1,0 +1,48 @@
+"""`rcnn-odom ...`: jobs on files that are not experiments, one file a command."""
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+
+from rcnn_odom import __version__
+from rcnn_odom.cli import drift, frames, simulate
+from rcnn_odom.errors import InputError
+
+# Heavy imports stay inside the commands, so that --help answers at once.
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Args:
+        argv: arguments without the program's name; None takes those of the process.
+
+    Returns:
+        Exit status: 0, or 1 after one line on stderr about bad input, or 130 after Ctrl-C. Wrong usage
+        exits with 2.
+    """
+    arguments = _build_parser().parse_args(argv)
+    try:
+        status: int = arguments.run(arguments)
+        sys.stdout.flush()
+    except BrokenPipeError:
+        # The reader (`| head`) has gone. Python would complain about it once more at exit.
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
+        return 1
+    except (InputError, OSError) as error:
+        print(f"rcnn-odom: error: {error}", file=sys.stderr)
+        return 1
+    except KeyboardInterrupt:
+        print("rcnn-odom: interrupted", file=sys.stderr)
+        return 130
+    return status
+
+
+def _build_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="rcnn-odom", description="Jobs on files of laser odometry.")
+    parser.add_argument("--version", action="version", version=f"rcnn-odom {__version__}")
+    commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
+    for command in (drift, frames, simulate):
+        command.add(commands)
+    return parser

@@ -1,0 +1,7 @@
+"""``python -m rcnn_odom.cli``."""
+
+import sys
+
+from rcnn_odom.cli import main
+
+sys.exit(main())

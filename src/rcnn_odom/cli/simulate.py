@@ -1,0 +1,89 @@
+"""`rcnn-odom simulate`: simulated drives as files."""
+
+import argparse
+import json
+import shlex
+from pathlib import Path
+
+from rcnn_odom.cli.arguments import Subcommands, whole_number
+
+
+def add(commands: Subcommands) -> None:
+    """Adds the command to ``rcnn-odom``."""
+    parser = commands.add_parser(
+        "simulate",
+        help="write simulated drives in KITTI's layout",
+        description="Write simulated drives as DIR/sequences/NAME/{velodyne/*.bin,calib.txt,times.txt} and "
+        "DIR/poses/NAME.txt, for data=kitti and other tools. The same options give the same files.",
+    )
+    add = parser.add_argument
+    add("--out", type=Path, required=True, metavar="DIR", help="folder to write to, made where missing")
+    add("--layout", choices=["kitti"], default="kitti", help="layout of the files (%(default)s)")
+    add(
+        "--sequence",
+        nargs="+",
+        default=["00"],
+        metavar="NAME",
+        help="any names, each a world and a drive of its own (00)",
+    )
+    add(
+        "--frames",
+        type=whole_number(2),
+        metavar="N",
+        help="scans in each sequence, whatever its name and scale",
+    )
+    add(
+        "--scale",
+        choices=["small", "full"],
+        default="small",
+        help="full: 00 to 10 have as many scans as KITTI's; small: a tenth, 800 for 05, 07 and 10. "
+        "Other names have 600 (%(default)s)",
+    )
+    add(
+        "--world",
+        choices=["street", "indoor"],
+        default="street",
+        help="street: a car in a city; indoor: a robot with a 180-degree laser (%(default)s)",
+    )
+    add(
+        "--seed",
+        type=whole_number(0),
+        default=0,
+        metavar="S",
+        help="another number gives other worlds (%(default)s)",
+    )
+    add(
+        "--without",
+        action="append",
+        choices=["movers", "missing", "tilt"],
+        default=[],
+        help="leave out what moves, missing returns, or slopes and the car's tilt; can be repeated",
+    )
+    parser.set_defaults(run=_run_simulate)
+
+
+def _run_simulate(arguments: argparse.Namespace) -> int:
+    from rcnn_odom.datasets import simulated
+    from rcnn_odom.datasets.export import export_kitti, need_free_name
+
+    root, names = arguments.out, list(dict.fromkeys(arguments.sequence))
+    for name in names:
+        need_free_name(root, name)
+    for name in names:
+        sequence = simulated.load(
+            name,
+            world=arguments.world,
+            scale=arguments.scale,
+            frames=arguments.frames,
+            seed=arguments.seed,
+            movers="movers" not in arguments.without,
+            missing="missing" not in arguments.without,
+            tilt="tilt" not in arguments.without,
+        )
+        export_kitti(sequence, root)
+    tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
+    command = f"python evaluate.py data=kitti {shlex.quote(f'data.root={root}')} {tests}"
+    for option, value in simulated.SENSORS[arguments.world].items():
+        command += f" data.sensor.{option}={value:g}"
+    print(f"wrote {', '.join(names)} to {root}; score a trained network there: {command}")
+    return 0
