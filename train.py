@@ -2,17 +2,23 @@
 
 import logging
 import sys
+from functools import partial
 
 import hydra
 from omegaconf import DictConfig
 
-from rcnn_odom.job import run_command, run_job
+from rcnn_odom.job import in_sweep, run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
 
 
-def train(cfg: DictConfig) -> dict:
+def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     """Everything that one run does; returns what its ``metrics.json`` holds.
+
+    Args:
+        cfg: the configuration.
+        reuse: as a sweep's job does, leave it at that where the run is finished already, and take the
+            weights of a finished run with the very same training.
 
     Raises:
         InputError: see its message.
@@ -23,18 +29,24 @@ def train(cfg: DictConfig) -> dict:
 
     from rcnn_odom import experiment, runs
     from rcnn_odom.settings import plain
+    from rcnn_odom.sweep import one_at_a_time
 
     settings = plain(cfg)
-    run = Path(settings["run_dir"])
+    run, outputs = Path(settings["run_dir"]), Path(settings["outputs"])
+    if reuse and (done := runs.finished(run, settings)):
+        log.info("run %s is finished already", run)
+        return done
     trainer = experiment.build_trainer(settings, run)
     datamodule = experiment.build_datamodule(settings)
     runs.start_run(run, settings)
     datamodule.load()
-    runs.point_latest(Path(settings["outputs"]), run)
+    runs.point_latest(outputs, run)
     try:
-        metrics = experiment.train_module(settings, datamodule, trainer)
+        with one_at_a_time(outputs, runs.fingerprint(settings, datamodule)):
+            metrics = experiment.train_module(settings, datamodule, trainer, reuse=reuse)
     except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after the former
-        log.error("stopped; the same command with run_dir=%s goes on", run)
+        how = "" if reuse else f" with run_dir={run}"
+        log.error("stopped; the same command%s goes on", how)
         raise KeyboardInterrupt from None
     log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
     return metrics
@@ -43,7 +55,7 @@ def train(cfg: DictConfig) -> dict:
 @hydra.main(version_base="1.3", config_path="conf", config_name="config")
 def main(cfg: DictConfig) -> float | None:
     """Runs one job; its validation drift is what a sweep would minimise."""
-    metrics = run_job(train, cfg)
+    metrics = run_job(partial(train, reuse=in_sweep()), cfg)
     return None if metrics is None else metrics["val"]["drift"]
 
 

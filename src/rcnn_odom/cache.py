@@ -106,9 +106,21 @@ def cache_path(sequence: Sequence, sensor: Sensor, folder: Path) -> Path:
 
 
 def encode_sequences(
-    sequences: list[Sequence], sensor: Sensor, folder: Path, workers: int
+    sequences: list[Sequence],
+    sensor: Sensor,
+    folder: Path,
+    workers: int,
+    pool: Workers[Encoded] | None = None,
 ) -> list[EncodedSequence]:
     """The sequences with their depth vectors, from the cache or computed into it in parallel.
+
+    Args:
+        sequences: of names that differ.
+        sensor: what the depth vectors are like.
+        folder: of the cache.
+        workers: processes to start where something is missing.
+        pool: processes that run already, whose :class:`Encoding` opens drives by these names; it is used
+            without a progress bar in their place.
 
     Raises:
         InputError: a frame cannot be read, or the folder cannot be made or is full.
@@ -117,11 +129,17 @@ def encode_sequences(
     missing = {
         path: sequence
         for path, sequence in zip(paths, sequences, strict=True)
-        if not _is_whole(path, (len(sequence), sensor.bins))
+        if not is_cached(sequence, sensor, folder)
     }
     if missing:
         _make_folder(folder)
-        _encode_into(missing, sensor, workers)
+        if pool is not None:
+            _encode_into(missing, pool, sensor, quiet=True)
+        else:
+            drives = {sequence.name: sequence for sequence in missing.values()}
+            count = useful_workers(workers, sum(map(len, missing.values())))
+            with Workers(count, Encoding(drives.__getitem__, sensor)) as own:
+                _encode_into(missing, own, sensor, quiet=False)
     return [
         EncodedSequence(
             name=sequence.name,
@@ -136,9 +154,11 @@ def encode_sequences(
     ]
 
 
-def _is_whole(path: Path, shape: tuple[int, int]) -> bool:
+def is_cached(sequence: Sequence, sensor: Sensor, folder: Path) -> bool:
+    """Whether all its depth vectors are in the cache."""
+    path = cache_path(sequence, sensor, folder)
     try:
-        return np.load(path, mmap_mode="r").shape == shape
+        return np.load(path, mmap_mode="r").shape == (len(sequence), sensor.bins)
     except FileNotFoundError:
         return False
     except (ValueError, EOFError):
@@ -156,21 +176,23 @@ def _make_folder(folder: Path) -> None:
             left_over.unlink(missing_ok=True)
 
 
-def _encode_into(missing: dict[Path, Sequence], sensor: Sensor, workers: int) -> None:
+def _encode_into(
+    missing: dict[Path, Sequence], pool: Workers[Encoded], sensor: Sensor, *, quiet: bool
+) -> None:
     lengths = [len(sequence) for sequence in missing.values()]
     total = sum(lengths)
-    folder = next(iter(missing)).parent
-    log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
-    by_name = {path.name: sequence for path, sequence in missing.items()}
+    if not quiet:
+        folder = next(iter(missing)).parent
+        log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
+    names = [sequence.name for sequence in missing.values()]
     with ExitStack() as stack:
-        encoding = Encoding(by_name.__getitem__, sensor)
-        pool = stack.enter_context(Workers(useful_workers(workers, total), encoding))
-        bar = stack.enter_context(tqdm(total=total, desc="encoding scans", unit="scan", disable=None))
+        bar = tqdm(total=total, desc="encoding scans", unit="scan", disable=True if quiet else None)
+        stack.enter_context(bar)
         files = [
             stack.enter_context(_PartialFile(path, (length, sensor.bins)))
             for path, length in zip(missing, lengths, strict=True)
         ]
-        for (number, start, _), (scans, _) in pool.run(list(by_name), lengths):
+        for (number, start, _), (scans, _) in pool.run(names, lengths):
             files[number].write(start, scans)
             bar.update(len(scans))
 

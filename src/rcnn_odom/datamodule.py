@@ -167,6 +167,7 @@ class OdometryDataModule(L.LightningDataModule):
         fresh_epochs: of a training on new worlds in every epoch, where ``read`` makes a drive for any
             name: see :class:`rcnn_odom.fresh.FreshWorlds`. 0: every epoch sees the same drives.
         fresh_first: where the numbers of those worlds begin.
+        keep_worlds: new worlds go into the cache, for other trainings.
     """
 
     def __init__(
@@ -185,6 +186,7 @@ class OdometryDataModule(L.LightningDataModule):
         seed: int = 0,
         fresh_epochs: int = 0,
         fresh_first: int = 0,
+        keep_worlds: bool = False,
     ) -> None:
         super().__init__()
         self.read, self.sensor, self.cache_dir = read, sensor, Path(cache_dir)
@@ -194,6 +196,7 @@ class OdometryDataModule(L.LightningDataModule):
         self.workers = workers or os.cpu_count() or 1
         self.sequences: dict[str, list[EncodedSequence]] = {}
         self.fresh_epochs, self.fresh_first = fresh_epochs, fresh_first
+        self.keep_worlds = keep_worlds
         self.worlds: FreshWorlds | None = None
 
     def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
@@ -261,7 +264,13 @@ class OdometryDataModule(L.LightningDataModule):
         if self.fresh_epochs:
             self.close()
             self.worlds = FreshWorlds(
-                self.read, sequences, self.fresh_epochs, self.sensor, self.workers, self.fresh_first
+                self.read,
+                sequences,
+                self.fresh_epochs,
+                self.sensor,
+                self.workers,
+                self.fresh_first,
+                self.cache_dir if self.keep_worlds else None,
             )
             sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
         else:

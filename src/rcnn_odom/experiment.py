@@ -1,6 +1,8 @@
 """The steps of one experiment, as ``train.py`` and ``evaluate.py`` call them."""
 
+import json
 import logging
+import shutil
 import sys
 import time
 import warnings
@@ -23,6 +25,7 @@ from rcnn_odom.report import log_hyperparameters, report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
+from rcnn_odom.sweep import one_at_a_time
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
@@ -49,6 +52,7 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
         fresh_epochs=model["epochs"] if data.get("fresh_worlds") else 0,
         # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
         fresh_first=model["first_stage"]["epochs"] if "first_stage" in model else 0,
+        keep_worlds=data.get("keep_worlds", False),
         **data["augment"],
     )
 
@@ -71,14 +75,30 @@ def build_module(settings: Settings, datamodule: OdometryDataModule) -> Odometry
 
 
 class EpochLines(Callback):
-    """A line for each epoch, which a progress bar would not leave behind in a log."""
+    """A line for each epoch, which a progress bar would not leave behind in a log; and the time it took.
+
+    Attributes:
+        seconds: of training and validation up to the end of the last epoch, in all sittings.
+    """
+
+    def __init__(self) -> None:
+        self.seconds = 0.0
+
+    def state_dict(self) -> dict[str, float]:
+        """What a checkpoint keeps."""
+        return {"seconds": time.monotonic() - self.begun}
+
+    def load_state_dict(self, state_dict: dict[str, float]) -> None:
+        """Goes on from a checkpoint's."""
+        self.seconds = state_dict["seconds"]
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Starts the clock."""
-        self.start = time.monotonic()
+        self.begun = time.monotonic() - self.seconds
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Called after the epoch's validation."""
+        self.seconds = time.monotonic() - self.begun
         values = {name: float(value) for name, value in trainer.callback_metrics.items()}
         worlds = trainer.datamodule.worlds  # type: ignore[attr-defined]
         waited = f"  waited {worlds.waited:.0f} s for new worlds" if worlds and worlds.waited > 0.5 else ""
@@ -91,7 +111,7 @@ class EpochLines(Callback):
             percent(values.get("val/drift")),
             values["val/distance_mae_m"],
             values["val/heading_mae_deg"],
-            time.monotonic() - self.start,
+            self.seconds,
             waited,
         )
 
@@ -128,24 +148,58 @@ def _training_options(settings: Settings, run: Path) -> Settings:
     last = ModelCheckpoint(folder, "last", enable_version_counter=False)
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [best, last, EpochLines()],
+        "callbacks": [EpochLines(), best, last],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
         "log_every_n_steps": 10,
     }
 
 
-def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer) -> Report:
+def train_module(
+    settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, *, reuse: bool = False
+) -> Report:
     """Trains one module, a recurrent one's first stage before it, and scores it on the test sequences.
 
     A run that was stopped goes on after its last whole epoch.
+
+    Args:
+        settings: of the run.
+        datamodule: its data, loaded.
+        trainer: for its folder.
+        reuse: where another run among the outputs has finished the very same training (recordings,
+            network, recipe and seed), its weights are taken instead of training once more.
 
     Returns:
         What ``metrics.json`` holds.
     """
     run = Path(settings["run_dir"])
-    last = run / LAST
     metrics: Report = {"fingerprint": fingerprint(settings, datamodule), "seed": settings["seed"]}
+    twin = find_run(Path(settings["outputs"]), metrics["fingerprint"]) if reuse else None
+    if twin:
+        metrics |= _take_weights(twin, run)
+    else:
+        metrics |= _fit(settings, datamodule, trainer)
+    metrics |= finish_run(settings, datamodule, trainer, run)
+    log_hyperparameters(trainer, settings, metrics)
+    write_json(run / METRICS, metrics)
+    (run / LAST).unlink(missing_ok=True)
+    return metrics
+
+
+def _take_weights(twin: Path, run: Path) -> Report:
+    """Another run's best checkpoint, and what its ``metrics.json`` says of its training."""
+    told = json.loads((twin.parents[1] / METRICS).read_text())
+    log.info("the same training has been done in %s; its weights are taken", twin.parents[1])
+    (run / BEST).parent.mkdir(parents=True, exist_ok=True)
+    shutil.copyfile(twin, run / BEST)
+    kept = {key: told[key] for key in ("first_stage", "training", "val") if key in told}
+    return {**kept, "same_as": told.get("same_as", str(twin.parents[1]))}
+
+
+def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer) -> Report:
+    """Trains; the part of ``metrics.json`` that is about it."""
+    metrics: Report = {}
+    last = Path(settings["run_dir"]) / LAST
     module = build_module(settings, datamodule)
     if isinstance(module, RecurrentModule):
         path, cnn = first_stage(settings, datamodule)
@@ -154,24 +208,27 @@ def train_module(settings: Settings, datamodule: OdometryDataModule, trainer: L.
     if last.exists():
         log.info("going on from %s", last)
     trainer.fit(module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True)
-    metrics |= finish_run(settings, datamodule, trainer, run)
-    log_hyperparameters(trainer, settings, metrics)
-    write_json(run / METRICS, metrics)
-    last.unlink(missing_ok=True)
-    return metrics
+    best = trainer.checkpoint_callback
+    assert isinstance(best, ModelCheckpoint)
+    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
+    clock = next(callback for callback in callbacks if isinstance(callback, EpochLines))
+    drift = best.best_model_score
+    return {
+        **metrics,
+        "training": {"seconds": clock.seconds, "epochs": settings["model"]["epochs"]},
+        "val": {"drift": None if drift is None else float(drift), "lengths": module.scoring["lengths"]},
+    }
 
 
 def finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, run: Path) -> Report:
     """Scores the checkpoint with the best validation drift on the test sequences."""
     module = load_module(run / BEST)
     motions = estimate_test(module, datamodule, trainer)
-    best = trainer.checkpoint_callbacks[0].best_model_score  # type: ignore[attr-defined]
     logger = trainer.logger
     assert isinstance(logger, TensorBoardLogger)
     return {
         "variant": module.variant,
         "data": settings["data"]["name"],
-        "val": {"drift": None if best is None else float(best), "lengths": module.scoring["lengths"]},
         **report_test(module, motions, datamodule.sequences["test"], settings["data"], run, logger),
     }
 
@@ -198,13 +255,15 @@ def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Pat
         cnn_data = build_datamodule(cnn_settings)
         cnn_data.sequences = datamodule.sequences
         wanted = fingerprint(cnn_settings, cnn_data)
-        # The run's own comes first: it is there when the run was stopped after it.
-        path = find_run(run, wanted) or find_run(Path(settings["outputs"]), wanted)
-        if path is None:
-            log.info("first stage: no fitting cnn_cls in %s, training one", settings["outputs"])
-            start_run(run, cnn_settings)
-            train_module(cnn_settings, cnn_data, build_trainer(cnn_settings, run))
-            path = run / BEST
+        outputs = Path(settings["outputs"])
+        with one_at_a_time(outputs, wanted):
+            # The run's own comes first: it is there when the run was stopped after it.
+            path = find_run(run, wanted) or find_run(outputs, wanted)
+            if path is None:
+                log.info("first stage: no fitting cnn_cls in %s, training one", outputs)
+                start_run(run, cnn_settings)
+                train_module(cnn_settings, cnn_data, build_trainer(cnn_settings, run))
+                path = run / BEST
     log.info("first stage: %s", path)
     cnn = load_module(path, "cnn_cls", Sensor(**settings["data"]["sensor"]))
     for key in ("kernel_size", "pooling", "rotation_classes"):

@@ -4,10 +4,11 @@ import logging
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 
-from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive
+from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive, encode_sequences, is_cached
 from rcnn_odom.scan import Sensor
 from rcnn_odom.workers import Workers, useful_workers
 
@@ -18,7 +19,7 @@ NICENESS = 10
 
 
 class FreshWorlds:
-    """The training drives of every epoch of one stage, made beside the epoch before and kept in memory alone.
+    """The training drives of every epoch of one stage, made beside the epoch before.
 
     Epoch 0 of a stage's training has the training set itself, epoch e a drive ``NAME~(first + e)`` in
     place of each NAME, as long as it and whatever the number of workers or the epoch at which a stopped
@@ -31,6 +32,7 @@ class FreshWorlds:
         sensor: theirs.
         workers: processes.
         first: epochs of the stage before, so that a second stage has other worlds than the first one.
+        cache: folder where the worlds are kept for other trainings; None: in memory alone.
     """
 
     def __init__(
@@ -41,8 +43,10 @@ class FreshWorlds:
         sensor: Sensor,
         workers: int,
         first: int = 0,
+        cache: Path | None = None,
     ) -> None:
         self.read, self.drives, self.epochs, self.sensor, self.first = read, drives, epochs, sensor, first
+        self.cache = cache
         self.worker_count = useful_workers(workers, sum(map(len, drives)))
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
@@ -58,7 +62,7 @@ class FreshWorlds:
             InputError: a drive cannot be made.
         """
         wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
-        if wanted and self._workers is None:
+        if self._workers is None and not all(map(self._is_kept, wanted)):
             log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
             self._workers = Workers(self.worker_count, Encoding(self.read, self.sensor), NICENESS)
         self._made = {e: self._made.get(e) or self._maker.submit(self._make, e) for e in wanted}
@@ -67,9 +71,20 @@ class FreshWorlds:
         self.waited = time.monotonic() - start
         return drives
 
+    def _names(self, epoch: int) -> list[str]:
+        return [f"{drive.name}~{self.first + epoch}" for drive in self.drives]
+
+    def _is_kept(self, epoch: int) -> bool:
+        return self.cache is not None and all(
+            is_cached(self.read(name), self.sensor, self.cache) for name in self._names(epoch)
+        )
+
     def _make(self, epoch: int) -> list[EncodedSequence]:
+        names = self._names(epoch)
+        if self.cache is not None:
+            worlds = [self.read(name) for name in names]
+            return encode_sequences(worlds, self.sensor, self.cache, self.worker_count, self._workers)
         assert self._workers is not None
-        names = [f"{drive.name}~{self.first + epoch}" for drive in self.drives]
         scans = [np.empty(drive.scans.shape, np.float32) for drive in self.drives]
         poses = [np.empty_like(drive.poses) for drive in self.drives]
         lengths = [len(drive) for drive in self.drives]

@@ -1,44 +1,83 @@
-"""What stands around a Hydra job: mistakes of the user become one line and an exit status."""
+"""What stands around a Hydra job: its folder, and mistakes of the user as one line and an exit status."""
 
 import logging
 import os
 import re
 import sys
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
-from omegaconf import DictConfig
+from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.sweep import draws_its_jobs
 
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
+ERROR = "error.txt"
+"""In the folder of a sweep's job that failed: why, in one line."""
+
 _failed: list[Exception] = []
+
+
+def in_sweep() -> bool:
+    """Whether the present job is one of a multirun."""
+    return not OmegaConf.is_missing(HydraConfig.get().job, "num")
 
 
 def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
     """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
 
+    A mistake in a sweep is also written to ``error.txt`` in the job's folder, and raised: Hydra goes on
+    with the other jobs and raises it again at the end. Outside it is remembered for :func:`run_command`.
+
     Raises:
         KeyboardInterrupt: stopped, which also stops a sweep.
-
-    The mistake is remembered for :func:`run_command` and not raised: the other jobs of a sweep go on.
+        InputError, OSError: a mistake in a sweep.
     """
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
-    cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
     try:
+        if in_sweep():
+            _check_sweep(cfg)
+            (folder / ERROR).unlink(missing_ok=True)
+        cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
         return job(cfg)
     except SystemExit:  # how Lightning ends after Ctrl-C
         raise KeyboardInterrupt from None
     except (InputError, OSError) as error:
         log.error("error: %s", error)
+        if in_sweep():
+            _leave_error(folder, error)
+            raise
         _failed.append(error)
         return None
+    except Exception as error:
+        if in_sweep():
+            _leave_error(folder, error)
+        raise
+
+
+def _check_sweep(cfg: DictConfig) -> None:
+    hydra = HydraConfig.get()
+    if any(override.split("=")[0] == "run_dir" for override in hydra.overrides.task):
+        raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
+    devices = cfg.trainer.devices
+    if draws_its_jobs(hydra.sweeper._target_) and devices != 1:
+        raise InputError(
+            f"trainer.devices={devices}: every process of a run would draw other values from this sweeper; "
+            "set trainer.devices=1, or sweep over a grid"
+        )
+
+
+def _leave_error(folder: Path, error: Exception) -> None:
+    with suppress(OSError):  # the error itself may be that nothing can be written
+        (folder / ERROR).write_text(" ".join(f"{type(error).__name__}: {error}".split()) + "\n")
 
 
 def run_command(main: Callable[[], object]) -> int:
@@ -49,6 +88,8 @@ def run_command(main: Callable[[], object]) -> int:
         main()
     except KeyboardInterrupt:
         return 130
+    except InputError:  # of a sweep's job, which has told
+        return 1
     except (HydraException, OmegaConfBaseException, OSError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.
         message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]

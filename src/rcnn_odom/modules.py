@@ -52,7 +52,7 @@ class OdometryModule(L.LightningModule):
     def _build(self) -> CNN | RCNN:
         model = self.model
         cnn_classes = self.classes if self.classifies or self.recurrent else None
-        angle = model["angle"]
+        angle, dropout = model["angle"], model["dropout"]
         cnn = CNN(
             self.sensor.bins,
             self.sensor.max_range,
@@ -60,12 +60,13 @@ class OdometryModule(L.LightningModule):
             model["kernel_size"],
             model["pooling"],
             angle,
+            0.0 if self.recurrent else dropout,
         )
         if not self.recurrent:
             return cnn
         cnn.requires_grad_(not model["freeze"])
         head_classes = self.classes if self.classifies else None
-        return RCNN(cnn, head_classes, model["hidden_size"], model["layers"], angle)
+        return RCNN(cnn, head_classes, model["hidden_size"], model["layers"], angle, dropout)
 
     def set_motion_statistics(self, mean: FloatArray, deviation: FloatArray) -> None:
         """Mean and deviation (2,), (2,) of the training motions, the heads' units."""

@@ -152,12 +152,13 @@ class MotionHead(nn.Module):
 class LSTM(nn.Module):
     """Stacked LSTM layers written out: one product for the inputs of all steps, then the recurrence.
 
-    Equal to ``torch.nn.LSTM`` (batch first), whose CPU kernel repacks the weights at every call.
+    Equal to ``torch.nn.LSTM`` (batch first), whose CPU kernel repacks the weights at every call; but
+    dropout falls on the outputs of the last layer as well.
     """
 
-    def __init__(self, inputs: int, hidden: int, layers: int) -> None:
+    def __init__(self, inputs: int, hidden: int, layers: int, dropout: float = 0.0) -> None:
         super().__init__()
-        self.hidden = hidden
+        self.hidden, self.dropout = hidden, dropout
         widths = [inputs] + [hidden] * (layers - 1)
         self.weight_ih = nn.ParameterList([nn.Parameter(torch.empty(4 * hidden, width)) for width in widths])
         self.weight_hh = nn.ParameterList([nn.Parameter(torch.empty(4 * hidden, hidden)) for _ in widths])
@@ -187,7 +188,7 @@ class LSTM(nn.Module):
                 c = torch.sigmoid(f) * c + torch.sigmoid(i) * torch.tanh(g)
                 h = torch.sigmoid(o) * torch.tanh(c)
                 outputs.append(h)
-            inputs = torch.stack(outputs, 1)
+            inputs = F.dropout(torch.stack(outputs, 1), self.dropout, self.training)
             after.append((h, c))
         return inputs, tuple(after)
 
@@ -199,6 +200,7 @@ class CNN(nn.Module):
         bins, max_range: the sensor's; ranges are divided by ``max_range`` (metres).
         classes: rotation as classification; None for regression.
         kernel_size, pooling: see :class:`Encoder`. angle: see :class:`MotionHead`.
+        dropout: part of the features that training hides from the head.
     """
 
     def __init__(
@@ -209,9 +211,10 @@ class CNN(nn.Module):
         kernel_size: int = 3,
         pooling: Literal["avg", "max"] = "avg",
         angle: Literal["expectation", "argmax"] = "expectation",
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
-        self.max_range = max_range
+        self.max_range, self.dropout = max_range, dropout
         self.encoder = Encoder(bins, kernel_size, pooling)
         self.head = MotionHead(self.encoder.features, classes, angle)
 
@@ -222,7 +225,7 @@ class CNN(nn.Module):
 
     def forward(self, pairs: Tensor, state: None = None) -> tuple[Estimate, None]:
         """Estimates for pairs (B, T, 2, bins) in metres; a CNN has no state."""
-        return self.head(self.encode(pairs)), state
+        return self.head(F.dropout(self.encode(pairs), self.dropout, self.training)), state
 
 
 class RCNN(nn.Module):
@@ -232,6 +235,7 @@ class RCNN(nn.Module):
         cnn: the first stage, with its head.
         classes: rotation of the final head as classification; None for regression.
         hidden, layers: of the LSTM (paper: 1,024 and 2). angle: see :class:`MotionHead`.
+        dropout: part of each LSTM layer's outputs that training hides from what follows.
     """
 
     def __init__(
@@ -241,10 +245,11 @@ class RCNN(nn.Module):
         hidden: int = 1024,
         layers: int = 2,
         angle: Literal["expectation", "argmax"] = "expectation",
+        dropout: float = 0.0,
     ) -> None:
         super().__init__()
         self.cnn = cnn
-        self.lstm = LSTM(cnn.encoder.features + 2, hidden, layers)
+        self.lstm = LSTM(cnn.encoder.features + 2, hidden, layers, dropout)
         # Drawn as if the two estimates were all the input: as two among thousands of features they would
         # hardly be heard, and the LSTM would have to find out again what the first stage knows.
         with torch.no_grad():

@@ -2,24 +2,31 @@
 
 import logging
 import re
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
 import lightning as L
+import numpy as np
+import numpy.typing as npt
+import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
 from rcnn_odom.figures import motion_figure, trajectory_figure
+from rcnn_odom.latency import measure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
+from rcnn_odom.networks import State
 from rcnn_odom.settings import Settings, flat
 from rcnn_odom.trajectory import write_kitti, write_motions, write_tum
 
 log = logging.getLogger(__name__)
 
 PACKAGES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "rcnn-odom")
+LATENCY_FRAMES = 100
 Motions = dict[str, FloatArray]
 """Estimated motions (N-1, 2) by the name of the sequence."""
 
@@ -43,8 +50,9 @@ def report_test(
         logger: also gets the figures.
 
     Returns:
-        ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name, and
-        the ``versions`` of what computed them.
+        ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name,
+        ``latency`` of the network (see :func:`rcnn_odom.latency.measure`) and ``versions`` of what computed
+        them.
     """
     baselines = baseline_motions(module, sequences)
     reports = {
@@ -59,7 +67,30 @@ def report_test(
         others = {method: estimated[sequence.name] for method, estimated in baselines.items()}
         write_sequence(sequence, motions[sequence.name], others, title, data, folder, logger)
     versions = {package: version(package) for package in PACKAGES}
-    return {"test": test, "baselines": reports, "versions": versions}
+    latency = measure(*stepping(module, sequences[0].scans))
+    times = latency["median_ms"], latency["p99_ms"]
+    log.info("%s: %.2f ms a frame, 99th percentile %.2f, on one thread", module.variant, *times)
+    return {"test": test, "baselines": reports, "latency": latency, "versions": versions}
+
+
+def stepping(module: OdometryModule, scans: npt.NDArray[np.float32]) -> tuple[Callable[[int], object], int]:
+    """A network's estimate of one frame after the other, and how many frames to measure it on.
+
+    Args:
+        module: the network; a recurrent one carries its state from call to call.
+        scans: depth vectors (N, bins) in metres.
+    """
+    device = next(module.parameters()).device
+    tensor = torch.from_numpy(np.array(scans[: LATENCY_FRAMES + 1])).to(device)
+    state: State | None = None
+
+    def step(frame: int) -> object:
+        nonlocal state
+        with torch.no_grad():
+            estimate, state = module.network(tensor[None, None, frame - 1 : frame + 1], state)
+        return estimate.motion.cpu()
+
+    return step, len(tensor) - 1
 
 
 def baseline_motions(module: OdometryModule, sequences: list[EncodedSequence]) -> dict[str, Motions]:

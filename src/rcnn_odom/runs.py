@@ -43,6 +43,15 @@ def start_run(run: Path, settings: Settings) -> None:
     log.info("run %s, seed %d", run, settings["seed"])
 
 
+def finished(run: Path, settings: Settings) -> dict[str, Any] | None:
+    """What the ``metrics.json`` of a run holds if it was finished with these settings."""
+    try:
+        metrics: dict[str, Any] = json.loads((run / METRICS).read_text())
+        return metrics if read_settings(run) == settings else None
+    except (OSError, ValueError, InputError):
+        return None
+
+
 def write_config(folder: Path, settings: Settings) -> None:
     """The settings into a folder, at once or not at all."""
     folder.mkdir(parents=True, exist_ok=True)

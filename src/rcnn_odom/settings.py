@@ -59,7 +59,7 @@ RULES: dict[str, Rule] = {
     **dict.fromkeys(("beta", "learning_rate", "width_deg", "regression", "classification"), POSITIVE),
     **dict.fromkeys(("resolution_deg", "field_of_view_deg", "max_range"), POSITIVE),
     **dict.fromkeys(("freeze", "mirror", "per_sample_norm"), FLAG),
-    **dict.fromkeys(("fresh_worlds", "vary_pace", "movers", "missing", "tilt"), FLAG),
+    **dict.fromkeys(("fresh_worlds", "keep_worlds", "vary_pace", "movers", "missing", "tilt"), FLAG),
     "world": _one_of("street", "indoor"),
     "scale": _one_of("small", "full"),
     **dict.fromkeys(("train", "val", "test"), NAMES),
@@ -75,6 +75,7 @@ RULES: dict[str, Rule] = {
     "gradient_clip_algorithm": _one_of("norm"),
     **dict.fromkeys(("world_seed", "seed"), (_is_index, "must be a whole number, not negative")),
     "ring": (lambda value: value is None or _is_index(value), "must be null or a whole number, not negative"),
+    "dropout": (lambda value: _is_number(value) and 0 <= value < 1, "must be a number from 0 to below 1"),
     "max_turn_deg": (lambda value: _is_number(value) and value >= 0, "must be 0 or a positive number"),
     **dict.fromkeys(
         ("workers", "frames"),
