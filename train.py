@@ -28,8 +28,8 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     from pathlib import Path
 
     from rcnn_odom import experiment, runs
+    from rcnn_odom.lock import one_at_a_time
     from rcnn_odom.settings import plain
-    from rcnn_odom.sweep import one_at_a_time
 
     settings = plain(cfg)
     run, outputs = Path(settings["run_dir"]), Path(settings["outputs"])
@@ -42,7 +42,8 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     datamodule.load()
     runs.point_latest(outputs, run)
     try:
-        with one_at_a_time(outputs, runs.fingerprint(settings, datamodule)):
+        fingerprint = runs.fingerprint(settings, datamodule)
+        with one_at_a_time(outputs / "cache", fingerprint, "training the same"):
             metrics = experiment.train_module(settings, datamodule, trainer, reuse=reuse)
     except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after the former
         how = "" if reuse else f" with run_dir={run}"

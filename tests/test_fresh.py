@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import time
+from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -39,6 +40,30 @@ def make_worlds(training_set):
     yield make_worlds
     for worlds in made:
         worlds.close()
+
+
+def test_kept_worlds_are_the_same_and_made_once(training_set, tmp_path):
+    fresh = FreshWorlds(read, training_set, 3, SENSOR, 1)
+    keeping = FreshWorlds(read, training_set, 3, SENSOR, 1, cache=tmp_path)
+    again = FreshWorlds(unreadable_scans, training_set, 3, SENSOR, 1, cache=tmp_path)
+    try:
+        for epoch in (1, 2):
+            for expected, kept in zip(fresh.of(epoch), keeping.of(epoch), strict=True):
+                np.testing.assert_array_equal(kept.scans, expected.scans)
+                np.testing.assert_array_equal(kept.poses, expected.poses)
+        # Another training finds them all, and starts no process.
+        assert [drive.name for drive in again.of(1)] == [f"{name}~1" for name in NAMES]
+        assert again._workers is None
+    finally:
+        for worlds in (fresh, keeping, again):
+            worlds.close()
+
+
+def unreadable_scans(name):
+    def read_scan(frame):
+        raise AssertionError(f"{name} should come from the cache")
+
+    return replace(read(name), read_scan=read_scan)
 
 
 def processes(worlds):
@@ -114,6 +139,7 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
     script = tmp_path / "wait.py"
     script.write_text("""
 import time
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from stub_drives import read

@@ -19,6 +19,7 @@ from tqdm import tqdm
 
 from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
+from rcnn_odom.lock import one_at_a_time
 from rcnn_odom.motion import FloatArray, change_frame, relative_motions
 from rcnn_odom.scan import Sensor, encode
 from rcnn_odom.workers import Workers, useful_workers
@@ -125,21 +126,12 @@ def encode_sequences(
     Raises:
         InputError: a frame cannot be read, or the folder cannot be made or is full.
     """
-    paths = [cache_path(sequence, sensor, folder) for sequence in sequences]
-    missing = {
-        path: sequence
-        for path, sequence in zip(paths, sequences, strict=True)
-        if not is_cached(sequence, sensor, folder)
-    }
-    if missing:
+    if not all(is_cached(sequence, sensor, folder) for sequence in sequences):
         _make_folder(folder)
-        if pool is not None:
-            _encode_into(missing, pool, sensor, quiet=True)
-        else:
-            drives = {sequence.name: sequence for sequence in missing.values()}
-            count = useful_workers(workers, sum(map(len, missing.values())))
-            with Workers(count, Encoding(drives.__getitem__, sensor)) as own:
-                _encode_into(missing, own, sensor, quiet=False)
+        with one_at_a_time(folder, "encoding", "encoding scans"):
+            missing = [sequence for sequence in sequences if not is_cached(sequence, sensor, folder)]
+            _encode(missing, sensor, folder, workers, pool)
+    paths = [cache_path(sequence, sensor, folder) for sequence in sequences]
     return [
         EncodedSequence(
             name=sequence.name,
@@ -176,23 +168,26 @@ def _make_folder(folder: Path) -> None:
             left_over.unlink(missing_ok=True)
 
 
-def _encode_into(
-    missing: dict[Path, Sequence], pool: Workers[Encoded], sensor: Sensor, *, quiet: bool
+def _encode(
+    missing: list[Sequence], sensor: Sensor, folder: Path, workers: int, pool: Workers[Encoded] | None
 ) -> None:
-    lengths = [len(sequence) for sequence in missing.values()]
-    total = sum(lengths)
-    if not quiet:
-        folder = next(iter(missing)).parent
-        log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
-    names = [sequence.name for sequence in missing.values()]
+    if not missing:  # another process has been faster
+        return
+    lengths, total = [len(sequence) for sequence in missing], sum(map(len, missing))
     with ExitStack() as stack:
-        bar = tqdm(total=total, desc="encoding scans", unit="scan", disable=True if quiet else None)
+        quiet = pool is not None
+        if pool is None:
+            log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
+            drives = {sequence.name: sequence for sequence in missing}
+            encoding = Encoding(drives.__getitem__, sensor)
+            pool = stack.enter_context(Workers(useful_workers(workers, total), encoding))
+        bar = tqdm(total=total, desc="encoding scans", unit="scan", disable=quiet or None)
         stack.enter_context(bar)
         files = [
-            stack.enter_context(_PartialFile(path, (length, sensor.bins)))
-            for path, length in zip(missing, lengths, strict=True)
+            stack.enter_context(_PartialFile(cache_path(sequence, sensor, folder), (length, sensor.bins)))
+            for sequence, length in zip(missing, lengths, strict=True)
         ]
-        for (number, start, _), (scans, _) in pool.run(names, lengths):
+        for (number, start, _), (scans, _) in pool.run([sequence.name for sequence in missing], lengths):
             files[number].write(start, scans)
             bar.update(len(scans))
 

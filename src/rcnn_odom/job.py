@@ -34,8 +34,8 @@ def in_sweep() -> bool:
 def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
     """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
 
-    A mistake in a sweep is also written to ``error.txt`` in the job's folder, and raised: Hydra goes on
-    with the other jobs and raises it again at the end. Outside it is remembered for :func:`run_command`.
+    The mistake is remembered for :func:`run_command`. In a sweep it is also written to ``error.txt`` in the
+    job's folder, and raised: Hydra goes on with the other jobs and raises it again at the end.
 
     Raises:
         KeyboardInterrupt: stopped, which also stops a sweep.
@@ -52,10 +52,10 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
         raise KeyboardInterrupt from None
     except (InputError, OSError) as error:
         log.error("error: %s", error)
+        _failed.append(error)
         if in_sweep():
             _leave_error(folder, error)
             raise
-        _failed.append(error)
         return None
     except Exception as error:
         if in_sweep():

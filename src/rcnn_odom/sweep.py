@@ -1,19 +1,13 @@
-"""What the jobs of a sweep need to know of each other: their folders, and whose turn it is."""
+"""Where the jobs of a sweep are, as told by the command that asked for them."""
 
 import hashlib
-import logging
 import re
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 
-from filelock import FileLock, Timeout
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import OmegaConfBaseException
-
-log = logging.getLogger(__name__)
 
 LONGEST_NAME = 120
 SEPARATOR = "__"
@@ -67,27 +61,6 @@ def expected_folders(sweep: Path) -> list[str] | None:
         pairs = [pair for pair in job if pair.split("=")[0].lstrip("+~") not in naming.exclude_keys]
         names.append(folder_name(SEPARATOR.join(pairs).replace("=", naming.kv_sep)))
     return names
-
-
-@contextmanager
-def one_at_a_time(outputs: Path, fingerprint: str) -> Iterator[None]:
-    """Lets one process at a time train what this fingerprint stands for; the others wait.
-
-    The lock ends with its process, however that ends. On a network file system it needs working
-    ``flock``, as NFS 4 and Lustre have.
-    """
-    folder = outputs / "cache"
-    folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / f".{fingerprint}.lock")
-    try:
-        lock.acquire(timeout=0)
-    except Timeout:
-        log.info("another process is training the same; waiting for it")
-        lock.acquire()
-    try:
-        yield
-    finally:
-        lock.release()
 
 
 def draws_its_jobs(sweeper: str) -> bool:

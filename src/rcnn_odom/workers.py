@@ -8,7 +8,13 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 from itertools import pairwise
-from multiprocessing import get_context, resource_tracker
+from multiprocessing import (
+    get_all_start_methods,
+    get_context,
+    get_start_method,
+    resource_tracker,
+    set_start_method,
+)
 from multiprocessing.connection import Connection, wait
 from types import TracebackType
 from typing import Generic, TypeVar
@@ -69,6 +75,9 @@ class Workers(Generic[Answer]):
         self._remedy = remedy
         # Fresh processes: a fork of one that has started torch's threads can hang.
         context = get_context("spawn")
+        if get_start_method() not in get_all_start_methods():
+            # A process of joblib says "loky" here, and a fresh one would look for that without knowing it.
+            set_start_method("spawn", force=True)
         self._connections, self._processes = [], []
         with _what_workers_inherit():
             for _ in range(count):
