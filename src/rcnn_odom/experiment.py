@@ -15,17 +15,18 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from rcnn_odom.checkpoint import load_module
+from rcnn_odom.dashboard import Layout, log_run
 from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import Report, percent
+from rcnn_odom.lock import one_at_a_time
 from rcnn_odom.machine import keep_freed_memory, resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
-from rcnn_odom.report import log_hyperparameters, report_test
+from rcnn_odom.report import report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
-from rcnn_odom.sweep import one_at_a_time
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
@@ -148,7 +149,7 @@ def _training_options(settings: Settings, run: Path) -> Settings:
     last = ModelCheckpoint(folder, "last", enable_version_counter=False)
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [EpochLines(), best, last],
+        "callbacks": [EpochLines(), Layout(), best, last],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
         "log_every_n_steps": 10,
@@ -180,7 +181,8 @@ def train_module(
     else:
         metrics |= _fit(settings, datamodule, trainer)
     metrics |= finish_run(settings, datamodule, trainer, run)
-    log_hyperparameters(trainer, settings, metrics)
+    assert isinstance(trainer.logger, TensorBoardLogger)
+    log_run(trainer.logger, settings, metrics, trainer.global_step)
     write_json(run / METRICS, metrics)
     (run / LAST).unlink(missing_ok=True)
     return metrics
@@ -256,7 +258,7 @@ def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Pat
         cnn_data.sequences = datamodule.sequences
         wanted = fingerprint(cnn_settings, cnn_data)
         outputs = Path(settings["outputs"])
-        with one_at_a_time(outputs, wanted):
+        with one_at_a_time(outputs / "cache", wanted, "training the first stage"):
             # The run's own comes first: it is there when the run was stopped after it.
             path = find_run(run, wanted) or find_run(outputs, wanted)
             if path is None:

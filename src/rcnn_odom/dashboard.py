@@ -1,0 +1,79 @@
+"""TensorBoard as a dashboard: the layout of its custom scalars, and a run's row of its HParams tab."""
+
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from torch.utils.tensorboard.summary import hparams
+
+from rcnn_odom.settings import Settings, flat
+
+LAYOUT = {
+    "Loss": {
+        "all of it": ["Multiline", ["train/loss_epoch"]],
+        "its parts": ["Multiline", ["train/loss_distance_epoch", "train/loss_rotation_epoch"]],
+    },
+    "Drift (ratio)": {
+        "validation, the mean and each sequence": ["Multiline", ["val/drift.*"]],
+        "test, the mean and each sequence": ["Multiline", ["test/drift.*"]],
+    },
+    "Mean absolute error of a frame": {
+        "distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
+        "heading (degrees)": ["Multiline", ["(val|test)/heading_mae_deg"]],
+    },
+}
+"""Groups of charts by title, each with patterns of the scalars in it."""
+
+NOT_IN_ROW = ("run_dir", "outputs", "data.reader", "data.root", "data.reference", "data.workers")
+REPEATED = (
+    *("data.rotation_classes", "data.beta", "data.passes", "data.epochs"),
+    *("model.first_stage.kernel_size", "model.first_stage.pooling", "model.first_stage.rotation_classes"),
+)
+"""Settings that only stand for what ``model`` says as well."""
+
+CHOSEN_AS = {"model.variant": "model", "data.name": "data"}
+"""Settings whose column has the name of the choice on the command line, and so comes before its parts."""
+
+
+class Layout(Callback):
+    """Tells TensorBoard which scalars belong together."""
+
+    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Called once, before the first scalar."""
+        assert isinstance(trainer.logger, TensorBoardLogger)
+        trainer.logger.experiment.add_custom_scalars(LAYOUT)
+
+
+def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, Any], step: int) -> None:
+    """A finished run's row of the HParams tab: its settings, and drift as the metric; the scores as scalars.
+
+    No summary of an "experiment" is written, as Lightning would: the columns of the first run would stand for
+    those of all, in the order of the alphabet, and five are shown. Without it TensorBoard looks at all
+    runs, and shows first the settings in which they differ.
+
+    Args:
+        logger: of the run.
+        settings: of the run.
+        metrics: with ``val`` and ``test`` of what ``metrics.json`` holds.
+        step: training steps that it took.
+    """
+    row = {
+        CHOSEN_AS.get(name, name): value if type(value) in (int, float) else str(value)
+        for name, value in flat(settings).items()
+        if not name.startswith(NOT_IN_ROW + REPEATED)
+    }
+    test = metrics["test"]
+    # Under names of their own: as more points of val/drift they would purge that curve.
+    scores = {"val/best_drift": metrics["val"]["drift"], "test/drift": test["drift"]}
+    for name, scored in test["sequences"].items():
+        scores[f"test/drift/{name}"] = scored["drift"]["t_err"]
+    for error in ("distance_mae_m", "heading_mae_deg"):
+        frames = [scored["frames"] - 1 for scored in test["sequences"].values()]
+        errors = [scored[error] for scored in test["sequences"].values()]
+        scores[f"test/{error}"] = sum(f * e for f, e in zip(frames, errors, strict=True)) / sum(frames)
+    known = {name: value for name, value in scores.items() if value is not None}
+    logger.log_metrics(known, step)
+    _, *summaries = hparams(row, known)
+    for summary in summaries:
+        logger.experiment.file_writer.add_summary(summary, step)
