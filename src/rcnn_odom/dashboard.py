@@ -11,21 +11,32 @@ from rcnn_odom.settings import Settings, flat
 
 LAYOUT = {
     "Loss": {
-        "all of it": ["Multiline", ["train/loss_epoch"]],
-        "its parts": ["Multiline", ["train/loss_distance_epoch", "train/loss_rotation_epoch"]],
+        "loss": ["Multiline", ["train/loss_epoch"]],
+        "parts of the loss, of distance and rotation": [
+            "Multiline",
+            ["train/loss_distance_epoch", "train/loss_rotation_epoch"],
+        ],
     },
     "Drift (ratio)": {
-        "validation, the mean and each sequence": ["Multiline", ["val/drift.*"]],
-        "test, the mean and each sequence": ["Multiline", ["test/drift.*"]],
+        "validation drift, the mean and each sequence": ["Multiline", ["val/drift.*"]],
+        "test drift, the mean and each sequence": ["Multiline", ["test/drift.*"]],
     },
     "Mean absolute error of a frame": {
-        "distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
-        "heading (degrees)": ["Multiline", ["(val|test)/heading_mae_deg"]],
+        "error of distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
+        "error of heading (degrees)": ["Multiline", ["(val|test)/heading_mae_deg"]],
     },
 }
 """Groups of charts by title, each with patterns of the scalars in it."""
 
-NOT_IN_ROW = ("run_dir", "outputs", "data.reader", "data.root", "data.reference", "data.workers")
+NOT_IN_ROW = (
+    "run_dir",
+    "outputs",
+    "data.reader",
+    "data.root",
+    "data.reference",
+    "data.workers",
+    "data.keep_worlds",
+)
 REPEATED = (
     *("data.rotation_classes", "data.beta", "data.passes", "data.epochs"),
     *("model.first_stage.kernel_size", "model.first_stage.pooling", "model.first_stage.rotation_classes"),

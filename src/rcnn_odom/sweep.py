@@ -53,13 +53,14 @@ def expected_folders(sweep: Path) -> list[str] | None:
         swept = [f"{key}={value}" for key, value in (settings.sweeper.params or {}).items()]
         overrides = OverridesParser.create().parse_overrides([*swept, *settings.overrides.task])
         (jobs,) = BasicSweeper.split_arguments(overrides, None)
+        naming = settings.job.config.override_dirname
+        excluded, equals = set(naming.exclude_keys), str(naming.kv_sep)
     except (OSError, OmegaConfBaseException, HydraException, AttributeError):
         return None
-    naming = settings.job.config.override_dirname
     names = []
     for job in jobs:
-        pairs = [pair for pair in job if pair.split("=")[0].lstrip("+~") not in naming.exclude_keys]
-        names.append(folder_name(SEPARATOR.join(pairs).replace("=", naming.kv_sep)))
+        pairs = [pair for pair in job if pair.split("=")[0].lstrip("+~") not in excluded]
+        names.append(folder_name(SEPARATOR.join(pairs).replace("=", equals)))
     return names
 
 
