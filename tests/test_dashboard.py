@@ -111,7 +111,7 @@ def test_the_row_of_a_run_has_its_settings_and_drift(sweep, scores):
         assert row["model"].string_value == "cnn_reg"
         assert row["data"].string_value == "kitti"
         assert not any(name.startswith(("run_dir", "outputs", "data.root")) for name in row)
-        for tag, split in (("test/drift", "test"), ("val/best_drift", "val")):
+        for tag, split in (("drift/test", "test"), ("drift/validation", "val")):
             (event,) = events.Scalars(tag)
             assert event.value == pytest.approx(scores[kernel][split]["drift"], rel=1e-6)
         found.add(kernel)
@@ -163,7 +163,7 @@ def test_the_server_finds_the_setting_that_differs(tensorboard):
     assert [column["name"] for column in columns if column.get("differs")] == ["model.kernel_size"]
     assert columns[0]["name"] == "model.kernel_size"
     metrics = {metric["name"]["tag"] for metric in ask_experiment(tensorboard)["metricInfos"]}
-    assert {"test/drift", "test/drift/05", "val/best_drift"} <= metrics
+    assert {"drift/test", "drift/test/05", "drift/validation"} <= metrics
 
 
 # --- a real browser ------------------------------------------------------------------------------
@@ -230,7 +230,7 @@ def test_the_table_of_the_hparams_tab_has_swept_values_and_drift(open_tab, score
     shown = {}
     for row in rows:
         values = dict(zip(header, row, strict=True))
-        shown[float(values["model.kernel_size"])] = float(values["test/drift"])
+        shown[float(values["model.kernel_size"])] = float(values["drift/test"])
     # Five digits are shown.
     assert shown == {k: pytest.approx(s["test"]["drift"], rel=1e-4) for k, s in scores.items()}
 
@@ -248,6 +248,6 @@ def test_the_custom_scalars_have_groups_and_lines(open_tab, sweep):
 
 
 def test_the_scalars_and_the_figures_are_shown(open_tab):
-    open_tab("scalars", LINES, lambda lines: {"train", "val", "test/drift", "test/drift/05"} <= set(lines))
+    open_tab("scalars", LINES, lambda lines: {"train", "val", "drift/test", "drift/test/05"} <= set(lines))
     # A trajectory and a motion figure of each run, loaded to their pixels.
     open_tab("images", IMAGE_WIDTHS, lambda widths: len(widths) == 2 * len(KERNELS) and min(widths) > 300)

@@ -86,14 +86,14 @@ def test_tensorboard_has_losses_rate_drift_figures_and_hparams(configure, kitti,
         "val/drift/10",
         "val/distance_mae_m",
         "val/heading_mae_deg",
-        "test/drift",
+        "drift/test",
     } <= set(tags["scalars"])
     assert {"test/05_trajectory", "test/05_motion"} <= set(tags["images"])
     assert len(events.Scalars("val/drift")) == 2, (
         "a point for each epoch: the HParams row must not purge them"
     )
     assert min(event.value for event in events.Scalars("val/drift")) == pytest.approx(metrics["val"]["drift"])
-    assert events.Scalars("test/drift")[-1].value == pytest.approx(metrics["test"]["drift"], rel=1e-6)
+    assert events.Scalars("drift/test")[-1].value == pytest.approx(metrics["test"]["drift"], rel=1e-6)
     hparams = events.summary_metadata["_hparams_/session_start_info"].plugin_data.content
     assert b"model.kernel_size" in hparams
 

@@ -19,7 +19,7 @@ LAYOUT = {
     },
     "Drift (ratio)": {
         "validation drift, the mean and each sequence": ["Multiline", ["val/drift.*"]],
-        "test drift, the mean and each sequence": ["Multiline", ["test/drift.*"]],
+        "test drift, the mean and each sequence": ["Multiline", ["drift/test.*"]],
     },
     "Mean absolute error of a frame": {
         "error of distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
@@ -75,10 +75,10 @@ def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, An
         if not name.startswith(NOT_IN_ROW + REPEATED)
     }
     test = metrics["test"]
-    # Under names of their own: as more points of val/drift they would purge that curve.
-    scores = {"val/best_drift": metrics["val"]["drift"], "test/drift": test["drift"]}
+    # Not val/drift, whose curve a point after its last would purge; and TensorBoard shows metrics by alphabet.
+    scores = {"drift/validation": metrics["val"]["drift"], "drift/test": test["drift"]}
     for name, scored in test["sequences"].items():
-        scores[f"test/drift/{name}"] = scored["drift"]["t_err"]
+        scores[f"drift/test/{name}"] = scored["drift"]["t_err"]
     for error in ("distance_mae_m", "heading_mae_deg"):
         frames = [scored["frames"] - 1 for scored in test["sequences"].values()]
         errors = [scored[error] for scored in test["sequences"].values()]

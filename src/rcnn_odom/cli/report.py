@@ -1,6 +1,7 @@
 """`rcnn-odom report`: what differs between the runs of a sweep."""
 
 import argparse
+import json
 from pathlib import Path
 
 from rcnn_odom.cli.arguments import Subcommands
@@ -33,6 +34,7 @@ def add(commands: Subcommands) -> None:
         metavar="KEY=VALUE",
         help="compare with this setting, such as model.kernel_size=3; can be repeated (the default's)",
     )
+    parser.add_argument("--json", action="store_true", help="print the runs and the comparisons as JSON")
     parser.set_defaults(run=_run_report)
 
 
@@ -40,6 +42,9 @@ def _run_report(arguments: argparse.Namespace) -> int:
     from rcnn_odom.summary.build import make_report
 
     written = make_report(arguments.directory, arguments.only, arguments.reference)
+    if arguments.json:
+        print(json.dumps(written.content, indent=1))
+        return 0
     print(f"{written.table}\n")
     if written.unfinished:
         print(

@@ -1,9 +1,11 @@
 """A sweep's report, from its runs to its files."""
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.summary.comparisons import compare, drifts_by_setting
@@ -28,12 +30,14 @@ class Written:
         html: path of ``report.html``.
         table: the comparison table for a terminal.
         unfinished: runs that are not finished, missing ones included.
+        content: ``runs``, the rows of ``load_runs``, and ``comparisons``, ready for JSON.
     """
 
     markdown: Path
     html: Path
     table: str
     unfinished: int
+    content: dict[str, Any]
 
 
 def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequence[str] = ()) -> Written:
@@ -57,6 +61,7 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
     drifts = drifts_by_setting(sweep)
     comparisons = compare(drifts, chosen)
     figures = {"drift": png(drift_figure({sweep.label(key): runs for key, runs in drifts.items()}))}
+    table = runs_table(sweep)
     parts = [
         opening(sweep, datetime.now()),
         result(sweep, chosen, comparisons),
@@ -66,10 +71,18 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
         frame_section(sweep),
         curves_section(sweep, figures),
         trajectories_section(sweep, figures),
-        runs_section(sweep, runs_table(sweep)),
+        runs_section(sweep, table),
         origin_section(sweep),
     ]
     text = "\n\n".join(filter(None, parts))
     paths = write_report(sweep.directory, f"Runs in {sweep.directory.resolve().name}", text, figures)
     unfinished = len(sweep.runs) - len(sweep.finished) + len(sweep.missing)
-    return Written(*paths, text_table(*drift_table(sweep)), unfinished)
+    content = {
+        "runs": json.loads(table.dropna(axis="columns", how="all").to_json(orient="records")),
+        "comparisons": [
+            {"setting": sweep.label(one.setting), "against": sweep.label(one.against), "verdict": one.verdict}
+            | {**asdict(one.ratio), "p_holm": one.adjusted_p}
+            for one in comparisons
+        ],
+    }
+    return Written(*paths, text_table(*drift_table(sweep)), unfinished, content)
