@@ -125,7 +125,7 @@ def test_what_is_not_finished_comes_first_and_in_no_mean(bare, capsys):
     (bare / "kernel_size=5,seed=2" / "metrics.json").write_text("{")
     begin_run(bare / "<b>x|y", ["model=cnn_cls", "model.kernel_size=7", "seed=0"])
     assert main(["report", str(bare)]) == 0
-    assert "3 runs are not finished and in no mean" in capsys.readouterr().out
+    assert "not finished, and in no mean: 3;" in capsys.readouterr().out
     text = (bare / "report.md").read_text()
     assert "Of 7 runs: 4 finished, 1 failed, 1 unfinished, 1 damaged." in text
     warning = text[: text.index("Swept:")]

@@ -47,8 +47,6 @@ def _run_report(arguments: argparse.Namespace) -> int:
         return 0
     print(f"{written.table}\n")
     if written.unfinished:
-        print(
-            f"{written.unfinished} runs are not finished and in no mean; the report begins with their list\n"
-        )
+        print(f"not finished, and in no mean: {written.unfinished}; the report begins with their list\n")
     print(f"{written.markdown}\n{written.html}")
     return 0
