@@ -364,10 +364,14 @@ def test_no_stage_sees_the_new_worlds_of_the_other(configure, monkeypatch):
     assert len(set.union(*new)) == sum(map(len, new))
 
 
-def test_first_stage_on_fixed_worlds_does_not_serve_for_fresh_ones(configure):
+@pytest.mark.parametrize(
+    "option",
+    ["fresh_worlds", "vary_pace", "realism.movers", "realism.missing", "realism.tilt"],
+)
+def test_a_training_on_other_new_worlds_is_another_one(configure, option):
     prints = set()
-    for fresh in ("true", "false"):
-        settings = plain(configure("model=cnn_cls", *FRESH, f"data.fresh_worlds={fresh}"))
+    for flag in ("true", "false"):
+        settings = plain(configure("model=cnn_cls", *FRESH, f"data.{option}={flag}"))
         prints.add(fingerprint(settings, experiment.build_datamodule(settings).load(("train", "val"))))
     assert len(prints) == 2
 

@@ -159,10 +159,26 @@ def test_a_sweep_file_with_an_unknown_key_is_told_before_anything_runs(sweep, tm
     assert not runs_of(tmp_path)
 
 
+def test_a_sweep_without_multirun_is_refused(kitti, tmp_path):
+    script = [sys.executable, str(ROOT / "train.py"), *kitti, f"outputs={tmp_path}", "+sweeps=kernel_size"]
+    done = subprocess.run(script, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 1
+    assert "+sweeps= needs -m" in done.stdout + done.stderr
+
+
+def test_a_moved_sweep_is_known_again(sweep, tmp_path):
+    options = ["model=cnn_reg", "model.epochs=1", "seed=0"]
+    sweep(*options, f"hydra.sweep.dir={tmp_path}/here")
+    (tmp_path / "here").rename(tmp_path / "there")
+    printed = sweep(*options, f"hydra.sweep.dir={tmp_path}/there", f"outputs={tmp_path}/new")
+    assert "is finished already" in printed
+
+
 def test_sampling_sweepers_are_refused_on_several_devices(sweep):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="the extra 'sweeps' is not installed")
     printed = sweep("+sweeps=optuna", "trainer.devices=2", "hydra.sweeper.n_trials=1", status=1)
     assert "trainer.devices=2: every process of a run would draw other values from this sweeper" in printed
+    assert "Traceback" not in printed
 
 
 def test_optuna_minimises_validation_drift_and_goes_on(sweep, tmp_path):

@@ -46,6 +46,8 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
         if in_sweep():
             _check_sweep(cfg)
             (folder / ERROR).unlink(missing_ok=True)
+        elif "sweeps" in HydraConfig.get().runtime.choices:
+            raise InputError("+sweeps= needs -m: one run would take nothing from a sweep")
         cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
         return job(cfg)
     except SystemExit:  # how Lightning ends after Ctrl-C
@@ -71,7 +73,7 @@ def _check_sweep(cfg: DictConfig) -> None:
     if draws_its_jobs(hydra.sweeper._target_) and devices != 1:
         raise InputError(
             f"trainer.devices={devices}: every process of a run would draw other values from this sweeper; "
-            "set trainer.devices=1, or sweep over a grid"
+            "set trainer.devices=1"
         )
 
 
@@ -89,6 +91,12 @@ def run_command(main: Callable[[], object]) -> int:
     except KeyboardInterrupt:
         return 130
     except InputError:  # of a sweep's job, which has told
+        return 1
+    except ValueError as error:
+        if not _failed:
+            raise
+        # A sweeper that had no job to learn from; why they failed has been told.
+        print(f"error: {error}", file=sys.stderr)
         return 1
     except (HydraException, OmegaConfBaseException, OSError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.

@@ -16,7 +16,7 @@ from rcnn_odom.settings import Settings
 
 log = logging.getLogger(__name__)
 
-RECIPE_VERSION = 1
+RECIPE_VERSION = 2
 """Raised whenever the same settings train another network, so that an older first stage is not taken."""
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
@@ -32,7 +32,7 @@ def start_run(run: Path, settings: Settings) -> None:
     config = run / CONFIG
     if (run / METRICS).exists():
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
-    if config.exists() and read_settings(run) != settings:
+    if config.exists() and not _same(read_settings(run), settings):
         raise InputError(
             f"{config}: the run was begun with other settings; repeat them, or choose another run_dir"
         )
@@ -47,9 +47,15 @@ def finished(run: Path, settings: Settings) -> dict[str, Any] | None:
     """What the ``metrics.json`` of a run holds if it was finished with these settings."""
     try:
         metrics: dict[str, Any] = json.loads((run / METRICS).read_text())
-        return metrics if read_settings(run) == settings else None
+        return metrics if _same(read_settings(run), settings) else None
     except (OSError, ValueError, InputError):
         return None
+
+
+def _same(first: Settings, second: Settings) -> bool:
+    """Whether two configurations are of one run, wherever its folder now is."""
+    elsewhere = {"run_dir": None, "outputs": None}
+    return first | elsewhere == second | elsewhere
 
 
 def write_config(folder: Path, settings: Settings) -> None:
@@ -95,7 +101,8 @@ def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
         for split in ("train", "val")
     }
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
-    data["fresh_worlds"] = settings["data"].get("fresh_worlds", False)
+    if settings["data"].get("fresh_worlds"):  # drives that are not among the recordings yet
+        data["fresh_worlds"] = settings["data"]["reader"]
     parts = [RECIPE_VERSION, recordings, data, settings["model"], settings["trainer"], settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
