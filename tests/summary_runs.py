@@ -75,7 +75,6 @@ def metrics_of(settings, drifts, **changes):
         "versions": {"torch": "2.13.0", "numpy": "2.4.6"},
         "latency": {"median_ms": 4.0, "p99_ms": 6.0, "threads": 1, "frames": 700},
         "training": {"seconds": 90.0, "epochs": 2},
-        "command": "python train.py -m +sweeps=kernel_size",
     }
     metrics |= changes
     return {key: value for key, value in metrics.items() if value is not None}

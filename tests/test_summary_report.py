@@ -10,12 +10,15 @@ import yaml
 from rcnn_odom.cli import main
 from rcnn_odom.metrics.drift import drift
 from rcnn_odom.summary.build import make_report
-from rcnn_odom.summary.curves import Segments, by_speed, file_name, run_segments, trajectory
+from rcnn_odom.summary.curves import Segments, by_speed, run_segments, trajectory
 from rcnn_odom.summary.folders import read_run
 from rcnn_odom.summary.tables import code, duration, escape, markdown_table
+from rcnn_odom.trajectory import file_name
 from summary_runs import begin_run, finish_run, write_trajectories
 
 DRIFTS = {3: (0.20, 0.22, 0.18), 5: (0.10, 0.12, 0.09)}
+VALIDATION = {3: 0.15, 5: 0.16}
+"""In another order than the test drifts."""
 
 
 @pytest.fixture(scope="session")
@@ -26,7 +29,11 @@ def finished(tmp_path_factory):
         for seed, value in enumerate(drifts):
             run = folder / f"kernel_size={kernel},seed={seed}"
             overrides = ["model=cnn_cls", f"model.kernel_size={kernel}", f"seed={seed}"]
-            finish_run(run, overrides, {"05": value, "07": value + 0.02})
+            changes = {
+                "val": {"drift": VALIDATION[kernel] + 0.01 * seed},
+                "latency": {"median_ms": 4.0 + seed},
+            }
+            finish_run(run, overrides, {"05": value, "07": value + 0.02}, **changes)
             write_trajectories(run, 1 + value / 2, value / 100)
     return folder
 
@@ -63,6 +70,7 @@ def test_the_tables_hold_means_and_deviations(sweep, capsys):
     expected = [
         "kernel_size=3",
         "3",
+        "16.00 ± 1.00",
         "20.00 ± 2.00",
         "22.00 ± 2.00",
         "21.00 ± 2.00",
@@ -73,21 +81,19 @@ def test_the_tables_hold_means_and_deviations(sweep, capsys):
     assert row(section(text, "Drift"), "held_motion") == [
         "held_motion",
         "-",
-        *["50.00", "70.00", "60.00", "0.0600", "-"],
+        *["-", "50.00", "70.00", "60.00", "0.0600", "-"],
     ]
-    assert row(section(text, "Drift"), "floor of two-number motion")[2:5] == ["0.40"] * 3
+    assert row(section(text, "Drift"), "floor of two-number motion")[3:6] == ["0.40"] * 3
     frame = ["kernel_size=5", "0.2929", "-0.1464", "1.050", "0.5857", "+0.2929", "2.100"]
     assert row(section(text, "Errors of a frame"), "kernel_size=5") == frame
     difference = row(section(text, "Differences"), "kernel_size=5")
-    assert difference[1:4] == ["kernel_size=3", "lower drift", "3"]
+    assert difference[1:3] == ["lower drift", "3"]
     logs = np.log([[0.11, 0.13, 0.10], [0.21, 0.23, 0.19]])
-    assert difference[4] == f"{np.exp((logs[0] - logs[1]).mean()):.2f}"
-    assert "Lowest mean drift: **kernel_size=5**, 11.33 % over 3 seeds." in text
+    assert difference[3] == f"{np.exp((logs[0] - logs[1]).mean()):.2f}"
     assert "Warning" not in text
     assert "Trained for 9 min 00 s in all" in text
-    assert "    python train.py -m +sweeps=kernel_size\n" in text
     assert "Versions: torch 2.13.0, numpy 2.4.6." in text
-    assert "kernel_size=5 3 10.33 ± 1.53 12.33 ± 1.53" in " ".join(output.split())
+    assert "kernel_size=5 3 17.00 ± 1.00 10.33 ± 1.53 12.33 ± 1.53" in " ".join(output.split())
     assert output.splitlines()[-2:] == [f"{sweep}/report.md", f"{sweep}/report.html"]
     assert {path: path.read_bytes() for path in before} == before
 
@@ -130,9 +136,9 @@ def test_what_is_not_finished_comes_first_and_in_no_mean(bare, capsys):
     assert "Of 7 runs: 4 finished, 1 failed, 1 unfinished, 1 damaged." in text
     warning = text[: text.index("Swept:")]
     assert warning.count("> - **") == 3
-    assert row(text, "kernel_size=5")[1:5] == ["1 (fewer)", "10.00", "12.00", "11.00"]
-    assert row(text, "kernel_size=7")[1:5] == ["0 (fewer)", "-", "-", "-"]
-    assert row(section(text, "Differences"), "kernel_size=5")[2] == "one seed: nothing can be said"
+    assert row(text, "kernel_size=5")[1:6] == ["1 (fewer)", "16.00", "10.00", "12.00", "11.00"]
+    assert row(text, "kernel_size=7")[1:6] == ["0 (fewer)", "-", "-", "-", "-"]
+    assert row(section(text, "Differences"), "kernel_size=5")[1] == "one seed: nothing can be said"
     page = (bare / "report.html").read_text()
     assert "a|b &#60;img src=x&#62; &#42;c&#42;" in page.replace("&#124;", "|")
     assert "<img src=x>" not in page
@@ -149,7 +155,6 @@ def test_equal_settings_show_no_difference(tmp_path):
     text = (tmp_path / "report.md").read_text()
     cells = [
         "kernel_size=5",
-        "kernel_size=3",
         "no difference shown",
         "3",
         "1.00",
@@ -158,26 +163,59 @@ def test_equal_settings_show_no_difference(tmp_path):
         "1.000",
     ]
     assert row(section(text, "Differences"), "kernel_size=5") == cells
-    assert "no difference is shown" in text
+    assert "in test drift: 0 of 1." in text
     assert "Not drawn:" in text
 
 
-def test_the_reference_is_the_default_or_chosen(bare, tmp_path):
-    conf = tmp_path / "conf"
-    conf.mkdir()
-    (conf / "config.yaml").write_text(
-        "{data: {name: x}, model: {variant: a, kernel_size: 5}, trainer: {}, seed: 0}"
-    )
-    source = {"path": str(conf), "provider": "main"}
-    for run in bare.iterdir():
-        (run / ".hydra" / "overrides.yaml").write_text(yaml.safe_dump([f"model.{run.name.split(',')[0]}"]))
-        (run / ".hydra" / "hydra.yaml").write_text(
-            yaml.safe_dump({"hydra": {"runtime": {"config_sources": [source]}}})
-        )
+def test_the_best_is_told_by_validation(bare):
     make_report(bare)
-    assert "The reference is **kernel_size=5** (the default)." in (bare / "report.md").read_text()
-    make_report(bare, reference=["model.kernel_size=3"])
-    assert "The reference is **kernel_size=3** (chosen by --reference)." in (bare / "report.md").read_text()
+    text = (bare / "report.md").read_text()
+    best = "**kernel_size=3**, 16.00 % over 3 seeds. Its mean test drift is 21.00 %."
+    others = "It is the reference. Shown to differ from the reference in test drift: 1 of 1."
+    assert f"Lowest mean validation drift: {best} {others}" in text
+    assert "the reference **kernel_size=3** (the paper's choice)" in text
+    make_report(bare, reference=["model.kernel_size=5"])
+    text = (bare / "report.md").read_text()
+    assert f"{best} Against the reference, kernel_size=5: higher drift." in text
+    assert "the reference **kernel_size=5** (chosen by --reference)" in text
+
+
+def test_one_seed_shows_no_difference(tmp_path):
+    for beta, validation in ((1.0, 0.3), (2.0, 0.1), (3.0, 0.2)):
+        drifts = {"05": beta / 10, "07": beta / 10}
+        finish_run(tmp_path / f"{beta}", [f"model.beta={beta}"], drifts, val={"drift": validation})
+    make_report(tmp_path)
+    text = (tmp_path / "report.md").read_text()
+    assert (
+        "Lowest mean validation drift: **beta=2.0**, 10.00 % over one seed. Its mean test drift is 20.00 %. "
+        "No setting has two seeds, and one seed shows no difference." in text
+    )
+    assert "## Differences" not in text
+    assert "reference" not in text
+
+
+def test_a_reference_has_a_drift(bare):
+    for folder in bare.glob("kernel_size=3,*"):
+        (folder / "metrics.json").unlink()
+    for seed in range(2):
+        overrides = ["model=cnn_cls", "model.kernel_size=7", f"seed={seed}"]
+        finish_run(bare / f"kernel_size=7,seed={seed}", overrides, {"05": 0.3, "07": 0.3})
+    make_report(bare)
+    text = (bare / "report.md").read_text()
+    assert "the reference **kernel_size=5** (the first that has a drift)" in text
+    assert row(section(text, "Differences"), "kernel_size=7")[2] == "2"
+
+
+def test_the_command_is_hydras(bare):
+    overrides = {
+        "hydra": ["hydra/launcher=joblib", "hydra.mode=MULTIRUN"],
+        "task": ["+sweeps=kernel_size", "data.val=[c[:0.5]]"],
+    }
+    (bare / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": overrides}}))
+    make_report(bare)
+    origin = section((bare / "report.md").read_text(), "Where it comes from")
+    command = "python train.py -m hydra/launcher=joblib +sweeps=kernel_size 'data.val=[c[:0.5]]'"
+    assert re.findall("    (python.*)", origin) == [command]
 
 
 @pytest.mark.parametrize(
@@ -217,19 +255,20 @@ def test_no_finished_run_is_told(tmp_path, capsys):
 
 def test_other_versions_are_told(tmp_path):
     finish_run(tmp_path / "a", ["seed=0"], {"05": 0.1, "07": 0.1})
-    finish_run(tmp_path / "b", ["seed=1"], {"05": 0.1, "07": 0.1}, versions={"torch": "2.14"}, command=None)
+    finish_run(tmp_path / "b", ["seed=1"], {"05": 0.1, "07": 0.1}, versions={"torch": "2.14"})
     make_report(tmp_path)
     text = (tmp_path / "report.md").read_text()
     assert "> **Warning: the runs were made with different versions of torch.**" in text
     assert "torch 2.13.0 and 2.14" in text
-    assert "    python train.py seed=1\n" in text
+    commands = "    python train.py seed=0\n    python train.py seed=1\n"
+    assert f"Put together from the options of the runs:\n\n{commands}" in text
 
 
 def test_segments_are_those_of_the_drift(finished):
     run = read_run(finished / "kernel_size=3,seed=0", "x")
     segments = run_segments(run, ["05"])
     truth, estimate = trajectory(run, "05")
-    expected = drift(truth, estimate, planar=True, lengths=run.metrics["test"]["lengths"])
+    expected = drift(truth, estimate, planar=True, lengths=run.metrics.lengths)
     assert len(segments.t_err) == expected.segments
     assert segments.t_err.mean() == pytest.approx(expected.t_err)
     assert segments.r_err_deg_per_m.mean() == pytest.approx(expected.r_err_deg_per_m)
@@ -250,12 +289,14 @@ def test_speeds_have_overlapping_places_as_in_the_devkit():
 def test_text_of_others_stays_text():
     from markdown import markdown
 
-    nasty = "a|b\n<i>c</i> & **d** `e` [f](http://g) ~h~ \\i _j_ $k$ snake_case"
+    nasty = "a|b\n<i>c</i> & **d** `e` [f](http://g) ~h~ \\i _j_ $k$ snake_case a__b __l__"
     table = markdown(markdown_table(["x", "y"], [[nasty, "1"]]), extensions=["tables"])
     shown = re.search(r"<td>(.*?)</td>", table)[1]
     assert not re.search(r"<[a-z]", shown)
     decoded = re.sub(r"&#(\d+);", lambda found: chr(int(found[1])), shown)
     assert decoded == " ".join(nasty.split())
+    names = markdown_table(["run", "x"], [["a__b", "a__b"], ["-", "-"]], names=["run"])
+    assert names.splitlines()[2:] == ["| `a__b` | a&#95;&#95;b |", "| - | - |"]
     assert code("model.kernel_size=3") == "`model.kernel_size=3`"
     assert code("a`b") == escape("a`b") == "a&#96;b"
 

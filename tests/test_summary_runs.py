@@ -1,12 +1,14 @@
 """The table of a sweep's runs: what is read, what is refused, what counts."""
 
+import json
+
 import numpy as np
 import pytest
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.summary import load_runs, runs_table
 from rcnn_odom.summary.runs_table import read_sweep
-from summary_runs import begin_run, finish_run, method
+from summary_runs import begin_run, finish_run, method, metrics_of, settings_of
 
 DRIFTS = {"05": 0.2, "07": 0.1}
 
@@ -60,7 +62,7 @@ def test_frame_errors_are_means_over_motions_and_the_largest(tmp_path):
 
 
 def test_older_runs_tell_less(tmp_path):
-    finish_run(tmp_path / "a", ["seed=0"], DRIFTS, latency=None, training=None, command=None)
+    finish_run(tmp_path / "a", ["seed=0"], DRIFTS, latency=None, training=None, versions=None)
     row = load_runs(tmp_path).iloc[0]
     assert row["drift"] == pytest.approx(0.15)
     assert np.isnan(row["latency_ms"])
@@ -102,6 +104,9 @@ def test_runs_that_are_not_finished_have_a_row_with_the_reason(tmp_path, monkeyp
     assert table.loc["kernel_size=3,seed=5", "problem"] == "config.yaml cannot be read"
     missing = table[table["status"] == "missing"]
     assert list(missing.index) == ["kernel_size=3,seed=6", "kernel_size=3,seed=7"]
+    assert set(missing["problem"]) == {
+        "the last command for this folder asked for it, and there is no such folder"
+    }
     assert table.loc[table["status"] != "finished", "drift"].isna().all()
 
 
@@ -111,6 +116,37 @@ def test_a_metrics_file_of_another_form_is_damaged(tmp_path, content):
     begin_run(tmp_path / "z", ["model.kernel_size=3", "seed=1"])
     (tmp_path / "z" / "metrics.json").write_text(content)
     assert load_runs(tmp_path).set_index("run").loc["z", "status"] == "damaged"
+
+
+@pytest.mark.parametrize(
+    "key", ["variant", "data", "test", "baselines", "val", "versions", "latency", "training"]
+)
+def test_a_spoiled_part_of_a_metrics_file_is_damage(tmp_path, key):
+    spoiled = None if key in ("variant", "data", "test") else ["x"]
+    assert _status_with(tmp_path, {key: spoiled}) == "damaged"
+
+
+@pytest.mark.parametrize("key", ["drift", "floor", "lengths", "sequences"])
+def test_a_part_that_a_score_lacks_is_damage(tmp_path, key):
+    test = method(DRIFTS)
+    del test[key]
+    assert _status_with(tmp_path, {"test": test}) == "damaged"
+
+
+@pytest.mark.parametrize("key", sorted(method(DRIFTS)["sequences"]["07"]))
+def test_a_part_that_a_sequence_lacks_is_damage(tmp_path, key):
+    test = method(DRIFTS)
+    del test["sequences"]["07"][key]
+    assert _status_with(tmp_path, {"test": test}) == "damaged"
+    assert _status_with(tmp_path, {"baselines": {"held_motion": test}}) == "damaged"
+
+
+def _status_with(folder, changes):
+    """Of a run whose metrics file has these values instead; those with None it lacks."""
+    if not (folder / "a").exists():
+        begin_run(folder / "a", ["seed=0"])
+    (folder / "a" / "metrics.json").write_text(json.dumps(metrics_of(settings_of({}), DRIFTS, **changes)))
+    return load_runs(folder)["status"].item()
 
 
 def test_a_first_stage_belongs_to_its_run(tmp_path):
@@ -141,7 +177,7 @@ def test_a_repeated_training_counts_once(tmp_path):
         finish_run(tmp_path / name, ["seed=7"], DRIFTS, same_as=same)
     table = load_runs(tmp_path).set_index("run")
     assert table["repeats"].dropna().to_dict() == {"a": "b", "c": "b"}
-    ((seeds,),) = [[seeds] for seeds in read_sweep(tmp_path).counting().values()]
+    ((seeds,),) = [[seeds] for seeds in read_sweep(tmp_path).by_setting.values()]
     assert {seed: run.name for seed, run in seeds.items()} == {7: "b"}
 
 
@@ -151,7 +187,7 @@ def test_settings_are_in_the_order_of_their_numbers(tmp_path):
             finish_run(tmp_path / f"{variant}-{beta}", [f"model={variant}", f"model.beta={beta}"], DRIFTS)
     sweep = read_sweep(tmp_path)
     assert sweep.options == ["model.variant", "model.beta"]
-    labels = [sweep.label(setting) for setting in sweep.counting()]
+    labels = [sweep.label(setting) for setting in sweep.by_setting]
     assert labels == [f"{v}, beta={b}" for v in ("cnn_reg", "rcnn_reg") for b in (0.5, 2.0, 10.0)]
 
 

@@ -3,6 +3,7 @@
 Poses here are (N, 4, 4) from the camera's frame (x right, y down, z forward) to a fixed frame.
 """
 
+import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
@@ -11,6 +12,11 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray
+
+
+def file_name(sequence: str) -> str:
+    """A sequence's name as it stands in names of files: ``c[0.5:]`` becomes ``c_0.5-``."""
+    return re.sub(r"[^\w.-]+", "_", sequence.replace(":", "-")).strip("_")
 
 
 def read_kitti(path: str | Path) -> FloatArray:

@@ -32,9 +32,14 @@ def add(commands: Subcommands) -> None:
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="compare with this setting, such as model.kernel_size=3; can be repeated (the default's)",
+        help="compare with this setting, such as model.kernel_size=3; can be repeated (without it: the "
+        "paper's choice, else the first)",
     )
-    parser.add_argument("--json", action="store_true", help="print the runs and the comparisons as JSON")
+    parser.add_argument(
+        "--json",
+        action="store_true",
+        help="print the runs and the comparisons as JSON; the files are written as well",
+    )
     parser.set_defaults(run=_run_report)
 
 

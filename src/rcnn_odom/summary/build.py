@@ -8,14 +8,17 @@ from pathlib import Path
 from typing import Any
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.summary.comparisons import compare, drifts_by_setting
-from rcnn_odom.summary.difference_section import difference_section
+from rcnn_odom.summary.comparisons import (
+    compare,
+    difference_section,
+    drifts_by_setting,
+    reference_setting,
+    result,
+)
 from rcnn_odom.summary.document import image, write_report
 from rcnn_odom.summary.figure_sections import curves_section, trajectories_section
-from rcnn_odom.summary.origin_sections import origin_section, runs_section
-from rcnn_odom.summary.overview import opening, result
+from rcnn_odom.summary.overview import opening, origin_section, runs_section
 from rcnn_odom.summary.plots import drift_figure, png
-from rcnn_odom.summary.reference import reference_setting
 from rcnn_odom.summary.runs_table import read_sweep, runs_table
 from rcnn_odom.summary.score_sections import drift_section, drift_table, frame_section, paper_section
 from rcnn_odom.summary.tables import text_table
@@ -80,7 +83,7 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
     content = {
         "runs": json.loads(table.dropna(axis="columns", how="all").to_json(orient="records")),
         "comparisons": [
-            {"setting": sweep.label(one.setting), "against": sweep.label(one.against), "verdict": one.verdict}
+            {"setting": sweep.label(one.setting), "against": sweep.label(chosen), "verdict": one.verdict}
             | {**asdict(one.ratio), "p_holm": one.adjusted_p}
             for one in comparisons
         ],

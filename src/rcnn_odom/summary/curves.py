@@ -1,6 +1,5 @@
 """Drift against the length of a segment and against its speed, as KITTI's devkit plots it."""
 
-import re
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,7 +12,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.drift import SegmentErrors, segment_errors, travelled
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.summary.folders import Run
-from rcnn_odom.trajectory import flatten, read_kitti
+from rcnn_odom.trajectory import file_name, flatten, read_kitti
 
 LEAST_SEGMENTS = 3
 """Fewer make no point of a curve, as in the devkit."""
@@ -49,11 +48,6 @@ class Curve:
     r_err_deg_per_m: FloatArray
 
 
-def file_name(sequence: str) -> str:
-    """A sequence's name as `rcnn_odom.report.write_sequence` puts it into names of files."""
-    return re.sub(r"[^\w.-]+", "_", sequence.replace(":", "-")).strip("_")
-
-
 def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
     """True and estimated camera poses (N, 4, 4) of a test sequence, flattened to the plane.
 
@@ -73,7 +67,7 @@ def run_segments(run: Run, sequences: Sequence[str]) -> Segments:
     parts = []
     for sequence in sequences:
         truth, estimate = trajectory(run, sequence)
-        errors = segment_errors(truth, estimate, run.metrics["test"]["lengths"], planar=True)
+        errors = segment_errors(truth, estimate, run.metrics.lengths)
         stamps = _read_stamps(run.folder / "trajectories" / f"{file_name(sequence)}.tum", len(truth))
         speed = _speeds(errors, travelled(truth), stamps)
         parts.append([errors.length, speed, errors.t_err, np.degrees(errors.r_err)])
@@ -103,7 +97,9 @@ def by_length(segments: Segments) -> Curve:
 def by_speed(segments: Segments) -> Curve:
     """Means over segments within 2 m/s of 2, 4, 6 ... m/s, as in `saveErrorPlots` of KITTI's devkit.
 
-    Neighbouring places share segments. Drives below ``SLOW`` have places every 0.1 m/s.
+    Neighbouring places share segments. Drives below ``SLOW`` have places every 0.1 m/s. Unlike in the
+    devkit, a speed is the true path over the recorded duration, not the nominal length over 0.1 s a frame,
+    and the places have no upper end.
     """
     fastest = np.nanmax(segments.speed, initial=0.0)
     step = 2.0 if fastest > SLOW else 0.1

@@ -1,14 +1,12 @@
 """Sections with figures: drift against length and speed, and trajectories."""
 
-from collections.abc import Mapping
-
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.summary.curves import by_length, by_speed, read_curves, trajectory
 from rcnn_odom.summary.document import image
 from rcnn_odom.summary.folders import Run
 from rcnn_odom.summary.options import setting_of
-from rcnn_odom.summary.plots import MOST_BANDS, length_figure, png, speed_figure, trajectories_figure
+from rcnn_odom.summary.plots import MOST_BANDS, curves_figure, png, trajectories_figure
 from rcnn_odom.summary.runs_table import Sweep
 from rcnn_odom.summary.tables import code, escape, percent
 
@@ -16,20 +14,17 @@ from rcnn_odom.summary.tables import code, escape, percent
 def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
     """Drift against length and speed; adds the figures."""
     segments, problems = {}, []
-    for setting, runs in sweep.counting().items():
+    for setting, runs in sweep.by_setting.items():
         found, missing = read_curves(list(runs.values()), sweep.sequences)
         problems += missing
         if found:
             segments[sweep.label(setting)] = found
-    lengths = {label: [by_length(one) for one in runs] for label, runs in segments.items()}
-    speeds = {label: [by_speed(one) for one in runs] for label, runs in segments.items()}
     lines = ["## Drift against length and speed"]
-    if any(len(curve.x) for runs in lengths.values() for curve in runs):
-        figures["length"] = png(length_figure(lengths))
-        lines.append(image("length", "translation and rotation error against the length of the segment"))
-    if any(len(curve.x) for runs in speeds.values() for curve in runs):
-        figures["speed"] = png(speed_figure(speeds))
-        lines.append(image("speed", "translation and rotation error against the speed over the segment"))
+    for over, means in (("length", by_length), ("speed", by_speed)):
+        curves = {label: [means(one) for one in runs] for label, runs in segments.items()}
+        if any(len(curve.x) for runs in curves.values() for curve in runs):
+            figures[over] = png(curves_figure(curves, over))
+            lines.append(image(over, f"translation and rotation error against the {over} of the segment"))
     if len(lines) > 1:
         lines.append(
             "Means over all segments, whatever sequence they are of. A line is the mean over seeds; a band, "
@@ -43,39 +38,27 @@ def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
 
 def trajectories_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
     """Trajectories of the best and the worst run; adds the figure."""
-    drifts = {run: run.scores()["drift"] for runs in sweep.counting().values() for run in runs.values()}
+    drifts = {run: run.metrics.scores["drift"] for runs in sweep.by_setting.values() for run in runs.values()}
     order = sorted((run for run in drifts if drifts[run] is not None), key=lambda run: drifts[run])
     if not order:
         return ""
     shown = {"best": order[0], "worst": order[-1]} if len(order) > 1 else {"only": order[0]}
     try:
-        rows = {_run_title(sweep, word, run): _panels(sweep, run) for word, run in shown.items()}
+        rows = {_run_title(sweep, word, run): _panels(run) for word, run in shown.items()}
     except InputError as error:
         return f"## Trajectories\n\nNot drawn: {escape(error)}"
     figures["trajectories"] = png(trajectories_figure(rows))
     names = " and ".join(f"{code(run.name)} ({word})" for word, run in shown.items())
-    words = (
-        f"Of the runs with the lowest and the highest mean drift, {names}: chosen after the fact, for show."
-        if len(order) > 1
-        else f"Of the one run that counts, {names}."
-    )
-    return "\n\n".join(
-        [
-            "## Trajectories",
-            words,
-            image("trajectories", "trajectories over the truth, seen from above"),
-        ]
-    )
+    words = f"Of {names}, by test drift: chosen after the fact, for show."
+    picture = image("trajectories", "trajectories over the truth, seen from above")
+    return f"## Trajectories\n\n{words}\n\n{picture}"
 
 
 def _run_title(sweep: Sweep, word: str, run: Run) -> str:
     setting, seed = sweep.label(setting_of(run, sweep.options)), run.settings["seed"]
-    return f"{word} run: {setting}, seed {seed}, mean drift {percent(run.scores()['drift'])} %"
+    return f"{word} run: {setting}, seed {seed}, mean drift {percent(run.metrics.scores['drift'])} %"
 
 
-def _panels(sweep: Sweep, run: Run) -> Mapping[str, tuple[FloatArray, FloatArray]]:
-    scores = run.scores()
-    return {
-        f"{name}: drift {percent(scores[f'drift_{name}'])} %": trajectory(run, name)
-        for name in sweep.sequences
-    }
+def _panels(run: Run) -> dict[str, tuple[FloatArray, FloatArray]]:
+    drifts = {name: percent(run.metrics.scores[f"drift_{name}"]) for name in run.metrics.sequences}
+    return {f"{name}: drift {drift} %": trajectory(run, name) for name, drift in drifts.items()}

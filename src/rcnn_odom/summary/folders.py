@@ -3,15 +3,14 @@
 import json
 import os
 import re
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
 import yaml
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.settings import Settings, flat
-from rcnn_odom.summary.scores import Report, method_scores, run_scores
+from rcnn_odom.summary.scores import Metrics, read_metrics
 
 # By name and not from rcnn_odom.runs, which brings all that a training needs: a report needs none of it.
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
@@ -29,7 +28,7 @@ class Run:
         problem: why it is not finished, one line; empty for a finished run.
         settings: its resolved configuration under dotted names; empty where that cannot be read.
         overrides: what its command set.
-        metrics: its ``metrics.json``; empty unless finished.
+        metrics: what its ``metrics.json`` holds; empty unless finished.
     """
 
     folder: Path
@@ -38,20 +37,12 @@ class Run:
     problem: str
     settings: Settings
     overrides: tuple[str, ...]
-    metrics: Report
+    metrics: Metrics = field(default_factory=Metrics)
 
     @property
     def is_evaluation(self) -> bool:
         """Scores without a training of its own, by ``evaluate.py``."""
-        return self.status == "finished" and "seed" not in self.metrics
-
-    def scores(self) -> dict[str, Any]:
-        """Of a finished run, see :func:`rcnn_odom.summary.scores.run_scores`."""
-        return run_scores(self.metrics)
-
-    def baselines(self) -> dict[str, dict[str, float | None]]:
-        """Scores of the baselines of a finished run, by their name."""
-        return {name: method_scores(report) for name, report in self.metrics.get("baselines", {}).items()}
+        return self.status == "finished" and not self.metrics.is_training
 
 
 def find_runs(directory: Path) -> list[Run]:
@@ -98,7 +89,7 @@ def _is_evaluation(folder: Path) -> bool:
 
 def read_run(folder: Path, name: str) -> Run:
     """A run from its folder; nothing that is wrong with it raises, its status tells."""
-    run = Run(folder, name, "unfinished", "", {}, _read_overrides(folder), {})
+    run = Run(folder, name, "unfinished", "", {}, _read_overrides(folder))
     if (folder / CONFIG).exists():
         run = replace(run, settings=_read_settings(folder / CONFIG))
         if not run.settings:
@@ -125,15 +116,11 @@ def _read_finished(run: Run) -> Run:
     if not run.settings:
         return replace(run, status="damaged", problem=f"{CONFIG} is missing")
     try:
-        metrics = json.loads((run.folder / METRICS).read_text(), parse_constant=_refuse)
-        finished = replace(run, status="finished", metrics=metrics)
-        finished.scores()
-        finished.baselines()
-        str(metrics["variant"])
-    except (OSError, ValueError, KeyError, TypeError, AttributeError) as error:
+        metrics = read_metrics(json.loads((run.folder / METRICS).read_text(), parse_constant=_refuse))
+    except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError) as error:
         what = f"{METRICS} cannot be read, or lacks what a finished run has"
         return replace(run, status="damaged", problem=f"{what} ({type(error).__name__}: {error})")
-    return finished
+    return replace(run, status="finished", metrics=metrics)
 
 
 def _refuse(constant: str) -> None:

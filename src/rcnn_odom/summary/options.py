@@ -17,13 +17,13 @@ SAME_DRIVES = tuple(
 )
 """What decides which drives are scored, and how: never different in one table."""
 
-WITHOUT_EFFECT = re.compile(
+NO_SETTING_OF_THEIR_OWN = re.compile(
     r"seed|run_dir|outputs|data\.(workers|keep_worlds)|data\.(reader|passes|epochs|beta|rotation_classes)\..*"
     r"|trainer\.(accelerator|devices)"
 )
 """Differences that make no setting of their own: they act through other options, or not at all."""
 
-APART = "their drifts cannot stand in one table"
+NOT_IN_ONE_TABLE = "their drifts cannot stand in one table"
 
 Values = tuple[Any, ...]
 """A setting: the values of the swept options in their order, lists as tuples."""
@@ -50,7 +50,7 @@ def swept_options(runs: Sequence[Run]) -> list[str]:
     options = [
         option
         for option in named
-        if not WITHOUT_EFFECT.fullmatch(option) and len({value_of(run, option) for run in runs}) > 1
+        if not NO_SETTING_OF_THEIR_OWN.fullmatch(option) and len({value_of(run, option) for run in runs}) > 1
     ]
     while (other := _unexplained(runs, options)) is not None:
         options.append(other)
@@ -72,7 +72,7 @@ def _unexplained(runs: Sequence[Run], options: Sequence[str]) -> str | None:
         names = dict.fromkeys(name for run in group for name in run.settings)
         for name in sorted(names, key=lambda name: not name.startswith("model.")):
             # Data that differ unasked are no setting of their own, see check_same_data.
-            if name.startswith("data.") or WITHOUT_EFFECT.fullmatch(name):
+            if name.startswith("data.") or NO_SETTING_OF_THEIR_OWN.fullmatch(name):
                 continue
             if len({value_of(run, name) for run in group}) > 1:
                 return name
@@ -92,29 +92,28 @@ def check_same_data(runs: Sequence[Run], options: Iterable[str]) -> None:
     allowed = set(options) - set(SAME_DRIVES)
     for run in runs[1:]:
         for name in sorted({*runs[0].settings, *run.settings}):
-            if not name.startswith("data.") or WITHOUT_EFFECT.fullmatch(name) or name in allowed:
+            if not name.startswith("data.") or NO_SETTING_OF_THEIR_OWN.fullmatch(name) or name in allowed:
                 continue
             pair = value_of(runs[0], name), value_of(run, name)
             if pair[0] != pair[1]:
                 first, second = map(show_value, pair)
                 raise InputError(
-                    f"{runs[0].name} and {run.name} differ in {name}, {first} and {second}: {APART}; "
-                    f"choose with --only {name}={second if pair[0] is None else first}, "
+                    f"{runs[0].name} and {run.name} differ in {name}, {first} and {second}: "
+                    f"{NOT_IN_ONE_TABLE}; choose with --only {name}={second if pair[0] is None else first}, "
                     "or name a folder of fewer runs"
                 )
     for run in runs[1:]:
-        names = [list(one.metrics["test"]["sequences"]) for one in (runs[0], run)]
-        if names[0] != names[1]:
+        first, second = (", ".join(one.metrics.sequences) for one in (runs[0], run))
+        if first != second:
             raise InputError(
-                f"{runs[0].name} was tested on {', '.join(names[0])}, {run.name} on {', '.join(names[1])}: "
-                f"{APART}; name a folder of fewer runs"
+                f"{runs[0].name} was tested on {first}, {run.name} on {second}: "
+                f"{NOT_IN_ONE_TABLE}; name a folder of fewer runs"
             )
 
 
 def same_drives(first: Run, second: Run) -> bool:
     """Whether two finished runs were scored on the same drives, in the same way."""
-    sequences = (list(run.metrics["test"]["sequences"]) for run in (first, second))
-    same_names = len(set(map(tuple, sequences))) == 1
+    same_names = first.metrics.sequences == second.metrics.sequences
     return same_names and setting_of(first, SAME_DRIVES) == setting_of(second, SAME_DRIVES)
 
 

@@ -1,13 +1,19 @@
-"""How a report begins: what was swept, which runs are not finished, and the outcome."""
+"""What a report says of the runs themselves: what was swept, how they ended, their time and origin."""
 
-from collections.abc import Sequence
+import shlex
+from collections.abc import Callable
 from datetime import datetime
+from typing import TYPE_CHECKING, Any
 
-from rcnn_odom.summary.comparisons import Comparison, drifts_by_setting, ranked
-from rcnn_odom.summary.options import Values, show_value
-from rcnn_odom.summary.runs_table import Sweep
-from rcnn_odom.summary.statistics import NO_DIFFERENCE, mean_sd
-from rcnn_odom.summary.tables import code, escape, percent
+import yaml
+
+from rcnn_odom.summary.folders import Run
+from rcnn_odom.summary.options import setting_of, show_value
+from rcnn_odom.summary.runs_table import MISSING, Sweep
+from rcnn_odom.summary.tables import DASH, code, duration, escape, markdown_table, number
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 
 def opening(sweep: Sweep, now: datetime) -> str:
@@ -31,12 +37,10 @@ def _problems(sweep: Sweep) -> str:
     for run in sweep.runs:
         if run.status != "finished":
             # A sweep's folders are named by what their runs set.
-            options = [override for override in run.overrides if override not in run.name]
+            options = [text for text in run.overrides if text.replace("=", "-") not in run.name]
             which = f" ({escape(', '.join(options))})" if options else ""
             problems.append(f"> - **{run.status}** {code(run.name)}{which}: {escape(run.problem)}")
-    problems += [
-        f"> - **missing** {code(name)}: asked for, and there is no such folder" for name in sweep.missing
-    ]
+    problems += [f"> - **missing** {code(name)}: {MISSING}" for name in sweep.missing]
     if not problems:
         return ""
     advice = (
@@ -50,7 +54,7 @@ def _problems(sweep: Sweep) -> str:
 def _swept(sweep: Sweep) -> str:
     rows = []
     for place, option in enumerate(sweep.options):
-        values = dict.fromkeys(show_value(setting[place]) for setting in sweep.counting())
+        values = dict.fromkeys(show_value(setting[place]) for setting in sweep.by_setting)
         rows.append(f"- {code(option)}: {', '.join(map(code, values))}")
     seeds = sorted({run.settings["seed"] for run in sweep.runs if run.settings})
     rows.append(f"- {code('seed')}: {', '.join(map(str, seeds))}")
@@ -60,39 +64,74 @@ def _swept(sweep: Sweep) -> str:
     return "\n".join(["Swept:", "", *rows, "", data])
 
 
-def result(sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]) -> str:
-    """The outcome in a sentence or two."""
-    drifts = drifts_by_setting(sweep)
-    order = ranked(drifts)
-    if len(order) < 2:
-        return ""
-    values = list(drifts[order[0]].values())
-    seeds = f"{len(values)} seeds" if len(values) > 1 else "one seed"
-    best = escape(sweep.label(order[0]))
-    lines = [f"Lowest mean drift: **{best}**, {percent(mean_sd(values)[0])} % over {seeds}."]
-    for comparison in comparisons:
-        if {comparison.setting, comparison.against} == {order[0], order[1]}:
-            words = _best_against_next(comparison, comparison.setting == order[0])
-            lines.append(f"Against the next, {escape(sweep.label(order[1]))}, {words}.")
-    shown = sum(
-        one.verdict in ("lower drift", "higher drift") for one in comparisons if one.against == reference
+def runs_section(sweep: Sweep, table: "pd.DataFrame") -> str:
+    """Every run with its setting, scores, time and place; the time of all together."""
+    labels = {run.name: _run_label(sweep, run) for run in sweep.runs}
+    cells: list[tuple[str, Callable[[Any], str]]] = [
+        ("run", lambda row: row["run"]),
+        ("setting", lambda row: labels.get(row["run"], DASH)),
+        ("status", lambda row: row["status"]),
+        ("seed", lambda row: _known(row["seed"])),
+        ("drift %", lambda row: number(100 * row["drift"])),
+        ("validation %", lambda row: number(100 * row["val_drift"])),
+        ("training", lambda row: duration(row["seconds"])),
+        ("first stage", lambda row: duration(row["first_stage_seconds"])),
+        ("same training as", lambda row: _known(row["same_as"])),
+    ]
+    rows = [[tell(row) for _, tell in cells] for _, row in table.iterrows()]
+    header = [name for name, _ in cells]
+    names = ("run", "same training as")
+    lines = ["## Runs and their time", markdown_table(header, rows, words=3, names=names)]
+    own = table[table["same_as"].isna()]
+    known = own["seconds"].notna().sum()
+    total = own["seconds"].sum() + own["first_stage_seconds"].sum()
+    lines.append(
+        f"Trained for {duration(total)} in all, by the {known} runs that tell their time. A run that "
+        "took the weights of the same training elsewhere is not counted; first stages are where a run "
+        "trained its own."
     )
-    others = sum(one.against == reference for one in comparisons)
-    count = (
-        f"{shown or 'none'} of the {others} others"
-        if others > 1
-        else ("the other" if shown else "not the other")
-    )
-    lines.append(f"Shown to differ from {escape(sweep.label(reference))}: {count}.")
-    return " ".join(lines)
+    repeats = table[table["repeats"].notna()]
+    if len(repeats):
+        pairs = (f"{code(row['run'])} ({code(row['repeats'])} counts)" for _, row in repeats.iterrows())
+        lines.append(f"Not counted, as another run has the same setting and seed: {', '.join(pairs)}.")
+    return "\n\n".join(lines)
 
 
-def _best_against_next(comparison: Comparison, best_comes_first: bool) -> str:
-    if comparison.verdict == NO_DIFFERENCE:
-        return "no difference is shown"
-    if comparison.adjusted_p is None:
-        return "so few seeds say nothing"
-    if (comparison.verdict == "lower drift") == best_comes_first:
-        return "a lower drift is shown"
-    # Means are over all seeds of a setting, and comparisons over those that both have.
-    return "over the seeds that both have a higher drift is shown"
+def _run_label(sweep: Sweep, run: Run) -> str:
+    return sweep.label(setting_of(run, sweep.options)) if run.settings else DASH
+
+
+def _known(value: Any) -> str:
+    return DASH if value is None or value != value else str(value)
+
+
+def origin_section(sweep: Sweep) -> str:
+    """The commands that made the runs, and what computed them."""
+    versions: dict[str, dict[str, None]] = {}
+    for run in sweep.finished:
+        for package, version in run.metrics.versions.items():
+            versions.setdefault(package, {})[version] = None
+    told = [f"{escape(package)} {escape(' and '.join(found))}" for package, found in versions.items()]
+    differing = [package for package, found in versions.items() if len(found) > 1]
+    warning = f"> **Warning: the runs were made with different versions of {escape(', '.join(differing))}.**"
+    return "\n\n".join(
+        [
+            "## Where it comes from",
+            *_commands(sweep),
+            *([warning] if differing else []),
+            f"Versions: {', '.join(told)}." if told else "No run tells its versions.",
+        ]
+    )
+
+
+def _commands(sweep: Sweep) -> list[str]:
+    """The folder's last command, as Hydra keeps it; where it keeps none, the options of each run."""
+    try:
+        given = yaml.safe_load((sweep.directory / "multirun.yaml").read_text())["hydra"]["overrides"]
+        options = [option for option in (*given["hydra"], *given["task"]) if option != "hydra.mode=MULTIRUN"]
+        title, commands = "The last command for this folder", [["-m", *map(str, options)]]
+    except (OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
+        title = "Put together from the options of the runs"
+        commands = [list(run.overrides) for run in sweep.finished if run.overrides]
+    lines = dict.fromkeys("    " + shlex.join(["python", "train.py", *options]) for options in commands)
+    return [f"{title}:", "\n".join(lines)] if lines else []

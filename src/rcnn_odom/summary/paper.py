@@ -36,7 +36,7 @@ VARIANTS = {
 }
 """Table II, its own networks by the name of the variant here."""
 
-OTHERS = (
+COMPARED_METHODS = (
     _column("DeepVO (one camera)", 0.0262, 0.0391, 0.0326, 1.0),
     _column("3D LiDAR CNN (Velas et al.)", 0.0235, 0.0177, 0.0206, 0.7),
 )

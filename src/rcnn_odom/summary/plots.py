@@ -59,35 +59,23 @@ def drift_figure(drifts: Mapping[str, Mapping[int, float]]) -> "Figure":
     return figure
 
 
-def length_figure(curves: Mapping[str, Sequence[Curve]]) -> "Figure":
-    """Drift against the length of the segment, a line for each setting.
+def curves_figure(curves: Mapping[str, Sequence[Curve]], over: str) -> "Figure":
+    """Translation and rotation error against the length or the speed of a segment, a line for each setting.
 
     Args:
         curves: of the seeds, by the label of the setting.
+        over: ``length`` or ``speed``, which is given in km/h for cars.
     """
-    return _curves_figure(curves, "length of the segment (m)", 1.0)
-
-
-def speed_figure(curves: Mapping[str, Sequence[Curve]]) -> "Figure":
-    """Drift against the speed over the segment, a line for each setting; km/h for cars.
-
-    Args:
-        curves: of the seeds, by the label of the setting.
-    """
-    fastest = max(np.max(curve.x, initial=0.0) for runs in curves.values() for curve in runs)
-    kmh = fastest > SLOW
-    return _curves_figure(curves, f"speed over the segment ({'km/h' if kmh else 'm/s'})", 3.6 if kmh else 1.0)
-
-
-def _curves_figure(curves: Mapping[str, Sequence[Curve]], across: str, scale: float) -> "Figure":
     from matplotlib.figure import Figure
 
+    fastest = max(np.max(curve.x, initial=0.0) for runs in curves.values() for curve in runs)
+    unit, scale = ("m", 1.0) if over == "length" else ("km/h", 3.6) if fastest > SLOW else ("m/s", 1.0)
     figure = Figure(figsize=(11, 4.4 + 0.18 * max(0, len(curves) - 3)), layout="constrained")
     panels: list[Axes] = list(figure.subplots(1, 2))
     for axes, label in zip(
         panels, ("translation error (%)", "rotation error (degrees per metre)"), strict=True
     ):
-        axes.set(xlabel=across, ylabel=label)
+        axes.set(xlabel=f"{over} of the segment ({unit})", ylabel=label)
         axes.grid(alpha=0.3)
     for index, (label, runs) in enumerate(curves.items()):
         for axes, values in zip(panels, _over_seeds(runs), strict=True):

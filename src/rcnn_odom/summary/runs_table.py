@@ -3,6 +3,7 @@
 import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,6 +17,7 @@ from rcnn_odom.summary.options import (
     setting_of,
     show_value,
     swept_options,
+    value_of,
 )
 from rcnn_odom.summary.paper import VARIANTS
 from rcnn_odom.sweep import expected_folders
@@ -24,12 +26,15 @@ if TYPE_CHECKING:
     import pandas as pd
 
 SCORES = (
-    *("drift", "floor", "val_drift", "rotation_deg_per_m"),
+    *("floor", "val_drift", "rotation_deg_per_m"),
     *("distance_mae_m", "distance_bias_m", "distance_max_m"),
     *("heading_mae_deg", "heading_bias_deg", "heading_max_deg"),
     *("latency_ms", "seconds", "first_stage_seconds"),
 )
-"""Columns of numbers; beside them are those of single sequences."""
+"""Columns of numbers, after those of the drift."""
+
+MISSING = "the last command for this folder asked for it, and there is no such folder"
+"""What is wrong with a missing run; what earlier commands asked for is not known."""
 
 
 @dataclass(frozen=True)
@@ -39,7 +44,7 @@ class Sweep:
     Attributes:
         directory: that folder.
         runs: trainings, whatever became of them.
-        missing: names of folders that the sweep's command asked for and that are not there.
+        missing: names of folders that the folder's last command asked for and that are not there.
         evaluations: finished ones by ``evaluate.py`` on the same drives.
         left_out: names of evaluations on other drives.
         options: full names of the swept options.
@@ -58,30 +63,28 @@ class Sweep:
         return [run for run in self.runs if run.status == "finished"]
 
     @property
-    def sequences(self) -> list[str]:
+    def sequences(self) -> tuple[str, ...]:
         """Names of the test sequences, the same in all finished runs."""
-        return list(self.finished[0].metrics["test"]["sequences"]) if self.finished else []
+        return self.finished[0].metrics.sequences if self.finished else ()
 
-    def counting(self) -> dict[Values, dict[int, Run]]:
+    @cached_property
+    def by_setting(self) -> dict[Values, dict[int, Run]]:
         """The finished runs by setting and seed; settings of which none has finished are there too.
 
         Where several have the same setting and seed one counts: it is one training, however often it was
         run. It is the first that did not take its weights from another.
         """
-        counting: dict[Values, dict[int, Run]] = {}
-        for run in sorted(self.runs, key=lambda run: bool(run.metrics.get("same_as"))):
-            if run.settings:
-                seeds = counting.setdefault(setting_of(run, self.options), {})
-                if run.status == "finished":
-                    seeds.setdefault(run.settings["seed"], run)
         order = dict.fromkeys(setting_of(run, self.options) for run in self.runs if run.settings)
-        return {setting: counting[setting] for setting in _by_value(order)}
+        by_setting: dict[Values, dict[int, Run]] = {setting: {} for setting in _by_value(order)}
+        for run in sorted(self.finished, key=lambda run: bool(run.metrics.scores["same_as"])):
+            by_setting[setting_of(run, self.options)].setdefault(run.settings["seed"], run)
+        return by_setting
 
     def label(self, setting: Values) -> str:
         """A setting for people, ``rcnn_reg, kernel_size=5``; the variant alone where nothing was swept."""
         if not self.options:
-            variants = dict.fromkeys(str(run.settings["model.variant"]) for run in self.runs if run.settings)
-            return ", ".join(variants) or "-"
+            variants = (value_of(run, "model.variant") for run in self.runs if run.settings)
+            return ", ".join(dict.fromkeys(map(show_value, variants)))
         names = [option.rsplit(".", 1)[-1] for option in self.options]
         parts = []
         for option, name, value in zip(self.options, names, setting, strict=True):
@@ -142,7 +145,8 @@ def load_runs(directory: str | Path, only: Sequence[str] = ()) -> "pd.DataFrame"
     Columns, empty (None or nan) where a run does not tell:
 
     - ``run``: its path below the folder; ``status``: ``finished``, ``unfinished``, ``failed``, ``damaged``,
-      or ``missing`` (its sweep asked for it, and there is no folder); ``problem``: why it is not finished.
+      or ``missing`` (the folder's last command asked for it, and it is not there); ``problem``: why it is
+      not finished.
     - ``variant``, ``seed``, ``data``.
     - a column for each swept option under its full name (``model.kernel_size``); lists as tuples.
       ``attrs["options"]`` of the table names them.
@@ -172,22 +176,18 @@ def runs_table(sweep: Sweep) -> "pd.DataFrame":
     """The table of :func:`load_runs` for runs that have been read."""
     import pandas as pd
 
-    counting = {run.name for seeds in sweep.counting().values() for run in seeds.values()}
-    rows = [_row(sweep, run, counting) for run in sweep.runs]
-    problem = "its sweep asked for it, and there is no such folder"
-    rows += [{"run": name, "status": "missing", "problem": problem} for name in sweep.missing]
-    per_sequence = [f"drift_{name}" for name in sweep.sequences]
-    columns = ["run", "status", "problem", "variant", "seed", "data"]
-    columns += [option for option in sweep.options if option not in columns]
-    columns += ["drift", *per_sequence, *SCORES[1:], "same_as", "repeats"]
+    rows = [_row(sweep, run) for run in sweep.runs]
+    rows += [{"run": name, "status": "missing", "problem": MISSING} for name in sweep.missing]
+    numbers = ["drift", *(f"drift_{name}" for name in sweep.sequences), *SCORES]
+    columns = ["run", "status", "problem", "variant", "seed", "data", *sweep.options]
+    columns += [*numbers, "same_as", "repeats"]
     table = pd.DataFrame(rows, columns=columns)
-    numbers = ["drift", *per_sequence, *SCORES[1:]]
     table = table.astype(dict.fromkeys(numbers, "float64") | {"seed": "Int64"})
     table.attrs["options"] = list(sweep.options)
     return table
 
 
-def _row(sweep: Sweep, run: Run, counting: set[str]) -> dict[str, Any]:
+def _row(sweep: Sweep, run: Run) -> dict[str, Any]:
     row: dict[str, Any] = {"run": run.name, "status": run.status, "problem": run.problem}
     if run.settings:
         setting = setting_of(run, sweep.options)
@@ -195,9 +195,9 @@ def _row(sweep: Sweep, run: Run, counting: set[str]) -> dict[str, Any]:
         for column, option in (("variant", "model.variant"), ("data", "data.name"), ("seed", "seed")):
             row[column] = run.settings.get(option)
         if run.status == "finished":
-            row |= run.scores() | {"first_stage_seconds": _first_stage_seconds(run)}
-            if run.name not in counting:
-                row["repeats"] = sweep.counting()[setting][run.settings["seed"]].name
+            row |= run.metrics.scores | {"first_stage_seconds": _first_stage_seconds(run)}
+            counted = sweep.by_setting[setting][run.settings["seed"]]
+            row["repeats"] = None if counted is run else counted.name
     return row
 
 

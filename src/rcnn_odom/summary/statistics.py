@@ -40,11 +40,10 @@ class Ratio:
 def paired_ratio(first: Mapping[int, float], second: Mapping[int, float]) -> Ratio:
     """Compare two settings by Student's paired t test on the logarithms of their drifts.
 
-    Paired, because a seed decides the order of the batches and (with new worlds) what is trained on in both
-    settings alike, so that a part of the scatter is common and leaves the difference. On logarithms,
-    because drifts are positive and scatter in proportion to their size; the answer is then a ratio.
-    The seeds are all that varies: the test drives are the same in every run, so the interval is about
-    other trainings on these drives and says nothing about other drives.
+    Paired, because a seed decides the order of the batches in both settings alike, so that a part of the
+    scatter is common and leaves the difference. On logarithms, because drifts are positive and scatter in
+    proportion to their size; the answer is then a ratio. Seeds vary initial weights and the order of
+    batches; training and test drives are the same in every run, so the interval says nothing about others.
 
     Args:
         first: drift (ratio, above 0) by seed.

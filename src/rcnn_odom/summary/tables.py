@@ -23,17 +23,21 @@ def code(text: object) -> str:
     return f"`{text}`" if _PLAIN.fullmatch(str(text)) and str(text).strip() == str(text) else escape(text)
 
 
-def markdown_table(header: Row, rows: Sequence[Row], words: int = 1) -> str:
+def markdown_table(header: Row, rows: Sequence[Row], words: int = 1, names: Row = ()) -> str:
     """A table in Markdown; the first ``words`` columns to the left, numbers after them to the right.
 
     Args:
         header: of the columns, plain text.
         rows: cells, plain text.
         words: how many columns hold words.
+        names: headings of columns that hold names, which are shown as code.
     """
+    show = [code if name in names else escape for name in header]
+    body = [
+        [DASH if text == DASH else tell(text) for tell, text in zip(show, row, strict=True)] for row in rows
+    ]
     rule = ["---" if column < words else "---:" for column in range(len(header))]
-    lines = [list(map(escape, header)), rule, *(list(map(escape, row)) for row in rows)]
-    return "\n".join(f"| {' | '.join(line)} |" for line in lines)
+    return "\n".join(f"| {' | '.join(line)} |" for line in [list(map(escape, header)), rule, *body])
 
 
 def text_table(header: Row, rows: Sequence[Row]) -> str:
