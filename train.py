@@ -28,9 +28,12 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     from pathlib import Path
 
     from rcnn_odom import experiment, runs
+    from rcnn_odom.errors import InputError
     from rcnn_odom.lock import one_at_a_time
     from rcnn_odom.settings import plain
 
+    if cfg.model.variant == "icp":
+        raise InputError("model=icp has nothing to train; score it: python evaluate.py model=icp data=...")
     settings = plain(cfg)
     run, outputs = Path(settings["run_dir"]), Path(settings["outputs"])
     if reuse and (done := runs.finished(run, settings)):

@@ -75,7 +75,7 @@ def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, An
         if not name.startswith(NOT_IN_ROW + REPEATED)
     }
     test = metrics["test"]
-    # Not val/drift, whose curve a point after its last would purge; and TensorBoard shows metrics by alphabet.
+    # Not val/drift, whose curve another point would purge; and TensorBoard sorts metrics by the alphabet.
     scores = {"drift/validation": metrics["val"]["drift"], "drift/test": test["drift"]}
     for name, scored in test["sequences"].items():
         scores[f"drift/test/{name}"] = scored["drift"]["t_err"]
