@@ -1,4 +1,7 @@
-"""Scores a finished run again, also on other data: ``python evaluate.py run=outputs/latest``."""
+"""Scores a finished run again, also on other data: ``python evaluate.py run=outputs/latest``.
+
+Or scan matching, which has no run: ``python evaluate.py model=icp data=simulated``.
+"""
 
 import logging
 import sys
@@ -12,11 +15,35 @@ log = logging.getLogger("rcnn_odom")
 
 
 def evaluate(cfg: DictConfig) -> dict:
-    """Scores the run's best checkpoint on its own test sequences, or on those of ``cfg.data``.
+    """Scores a run's best checkpoint, or scan matching; what its ``metrics.json`` holds.
 
     Raises:
         InputError: see its message.
     """
+    from pathlib import Path
+
+    from rcnn_odom import runs
+    from rcnn_odom.errors import InputError
+    from rcnn_odom.settings import plain
+
+    variant = cfg.model.variant if cfg.get("model") else None
+    if variant not in (None, "icp"):
+        raise InputError(
+            f"model={variant}: a trained network is scored by its run, run=outputs/...; leave out model="
+        )
+    if variant and not cfg.get("data"):
+        raise InputError("model=icp needs recordings: add data=simulated, indoor, kitti or carmen")
+    chosen = plain(cfg)
+    settings, metrics = _match_scans(chosen) if variant else _estimate_run(chosen)
+    folder = Path(chosen["run_dir"])
+    runs.write_config(folder, settings)
+    runs.write_json(folder / runs.METRICS, metrics)
+    log.info("all of it is in %s", folder)
+    return metrics
+
+
+def _estimate_run(chosen: dict) -> tuple[dict, dict]:
+    """Settings and metrics of a run's network on its own test sequences, or on those of ``data``."""
     import os
     from pathlib import Path
 
@@ -24,9 +51,7 @@ def evaluate(cfg: DictConfig) -> dict:
     from rcnn_odom.checkpoint import load_module
     from rcnn_odom.report import report_test
     from rcnn_odom.scan import Sensor
-    from rcnn_odom.settings import plain
 
-    chosen = plain(cfg)
     run, folder = Path(chosen["run"]), Path(chosen["run_dir"])
     settings = runs.read_settings(run)
     settings |= {key: chosen[key] for key in ("data", "trainer", "outputs") if chosen.get(key)}
@@ -34,16 +59,40 @@ def evaluate(cfg: DictConfig) -> dict:
     module = load_module(run / runs.BEST, sensor=Sensor(**settings["data"]["sensor"]))
     datamodule = experiment.build_datamodule(settings).load(("test",))
     motions = experiment.estimate_test(module, datamodule, trainer)
-    runs.write_config(folder, settings)
     metrics = {
         "run": os.path.relpath(run.resolve()),
         "variant": module.variant,
         "data": settings["data"]["name"],
     }
     metrics |= report_test(module, motions, datamodule.sequences["test"], settings["data"], folder)
-    runs.write_json(folder / runs.METRICS, metrics)
-    log.info("all of it is in %s", folder)
-    return metrics
+    return settings, metrics
+
+
+def _match_scans(chosen: dict) -> tuple[dict, dict]:
+    """Settings and metrics of scan matching on the test sequences of ``data``."""
+    from pathlib import Path
+
+    from hydra.utils import instantiate
+
+    from rcnn_odom.baselines.constant import mean_motion
+    from rcnn_odom.baselines.icp import PointToLineICP
+    from rcnn_odom.datamodule import OdometryDataModule
+    from rcnn_odom.report import report_icp
+    from rcnn_odom.scan import Sensor
+
+    data, sensor = chosen["data"], Sensor(**chosen["data"]["sensor"])
+    icp = PointToLineICP(sensor, **{key: value for key, value in chosen["model"].items() if key != "variant"})
+    read = instantiate({**data["reader"], "_partial_": True, "_convert_": "all"})
+    cache = Path(chosen["outputs"]) / "cache"
+    names = data["train"], data["val"], data["test"]
+    datamodule = OdometryDataModule(read, *names, sensor, cache, workers=data["workers"]).load(("test",))
+    sequences = datamodule.sequences["test"]
+    steps = {sequence.name: icp.estimate(sequence.scans) for sequence in sequences}
+    report = report_icp(
+        icp, steps, mean_motion(read, data["train"]), sequences, data, Path(chosen["run_dir"])
+    )
+    settings = {key: value for key, value in chosen.items() if key != "run"}
+    return settings, {"variant": "icp", "data": data["name"], **report}
 
 
 @hydra.main(version_base="1.3", config_path="conf", config_name="evaluate")

@@ -1,14 +1,18 @@
 """Scores of drives by hand."""
 
 import json
+from dataclasses import replace
+from itertools import pairwise
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 import torch
 
-from rcnn_odom.baselines.constant import ConstantMotion, held_motion
+from rcnn_odom.baselines.constant import ConstantMotion, held_motion, mean_motion
+from rcnn_odom.baselines.icp import PointToLineICP, Steps
 from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import (
     camera_trajectory,
     frame_errors,
@@ -22,8 +26,9 @@ from rcnn_odom.evaluation import (
     table,
 )
 from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
-from rcnn_odom.report import report_test
-from rcnn_odom.trajectory import read_motions, write_motions
+from rcnn_odom.report import report_icp, report_test
+from rcnn_odom.scan import Sensor
+from rcnn_odom.trajectory import read_kitti, read_motions, write_motions
 
 
 def drive(planar, name="drive", camera_from_laser=FORWARD_CAMERA):
@@ -238,10 +243,23 @@ def test_motions_are_read_as_they_were_written(tmp_path):
     np.testing.assert_array_equal(methods["held_motion"], held)
 
 
+class StubModule(torch.nn.Linear):
+    """Looks like a trained network to whoever reports on it."""
+
+    variant = "cnn_reg"
+
+    def __init__(self):
+        super().__init__(1, 1)
+
+    def network(self, pairs, state):
+        return SimpleNamespace(motion=pairs[..., 0, :2]), state
+
+    network.head = SimpleNamespace(mean=torch.tensor([0.75, 0.5]))
+
+
 def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     sequence = drive([(0, 0, 0), (1, 0, 0), (1, 1.5, 0.25)], "05")
-    module = SimpleNamespace(variant="cnn_reg", network=SimpleNamespace(head=SimpleNamespace()))
-    module.network.head.mean = torch.tensor([0.75, 0.5])
+    module = StubModule()
     data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
     report_test(module, {"05": np.array([[0.875, 0.0], [1.25, -0.5]])}, [sequence], data, tmp_path)
     header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
@@ -251,3 +269,77 @@ def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     )
     assert first == "1,0.875,0,1,0,0.75,0.5,0,0"
     assert second == "2,1.25,-0.5,1.5,0.25,0.75,0.5,0,0"
+
+
+SIDEWAYS = [(frame, 0.5 * frame, 0.1 * (frame % 2)) for frame in range(31)]
+"""Half as far to the left as ahead, which a turn by half a degree cannot say."""
+
+
+def test_poses_are_scored_with_their_sideways_part():
+    sequence = drive(SIDEWAYS)
+    cut_to_two = score(sequence, sequence.motions, [10.0])
+    whole = score(sequence, sequence.motions, [10.0], poses=sequence.poses)
+    assert whole["drift"]["t_err"] == pytest.approx(0, abs=1e-12)
+    assert whole["drift"]["segments"] == cut_to_two["drift"]["segments"] > 0
+    assert cut_to_two["drift"]["t_err"] > 0.1
+    assert whole["floor"] == cut_to_two["floor"] == cut_to_two["drift"]
+    assert whole["distance_mae_m"] == 0
+
+
+def test_poses_by_name_stand_for_one_sequence_alone():
+    sequences = [drive(SIDEWAYS, "a"), drive(SIDEWAYS, "b")]
+    motions = {sequence.name: sequence.motions for sequence in sequences}
+    report = score_all(sequences, motions, [10.0], poses={"a": sequences[0].poses})
+    assert report["sequences"]["a"]["drift"]["t_err"] == pytest.approx(0, abs=1e-12)
+    assert report["sequences"]["b"]["drift"]["t_err"] == report["sequences"]["b"]["floor"]["t_err"]
+
+
+def test_the_report_of_scan_matching_has_whole_poses_failures_and_no_mean_motion(tmp_path, caplog):
+    caplog.set_level("INFO")
+    sequence = drive(SIDEWAYS, "05")
+    # Steps of the truth, by hand: the frame before is turned by 0.1 in every second one.
+    steps = []
+    for (x0, y0, heading0), (x1, y1, heading1) in pairwise(SIDEWAYS):
+        place = complex(x1 - x0, y1 - y0) * np.exp(-1j * heading0)
+        steps.append((place.real, place.imag, heading1 - heading0))
+    estimated = {"05": Steps(np.array(steps), np.arange(30) < 4)}
+    data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
+    icp = PointToLineICP(Sensor(90.0, 180.0))
+    report = report_icp(icp, estimated, None, [sequence], data, tmp_path)
+    assert report["failures"] == {"05": 4}
+    assert "4 of 30 on 05" in caplog.text
+    assert report["test"]["drift"] == pytest.approx(0, abs=1e-9)
+    assert list(report["baselines"]) == ["held_motion"]
+    assert report["latency"]["frames"] == 30
+    assert {"numpy", "scipy", "numba"} <= set(report["versions"])
+    camera = read_kitti(tmp_path / "trajectories" / "05.txt")
+    np.testing.assert_allclose(camera[:, [2, 0], 3] * [1, -1], np.array(SIDEWAYS)[:, :2], atol=1e-9)
+    truth, methods = read_motions(tmp_path / "trajectories" / "05_motions.csv")
+    np.testing.assert_allclose(methods["estimate"], truth, atol=1e-12)
+    assert (tmp_path / "figures" / "05_trajectory.png").exists()
+
+
+def test_wheel_odometry_is_not_cut_to_two_numbers_either(tmp_path):
+    sequence = drive(SIDEWAYS, "05")
+    moved = planar_to_poses([(7, 8, 1.0)]) @ sequence.poses
+    sequence = replace(sequence, wheel_odometry=moved)
+    steps = {"05": Steps(np.zeros((30, 3)), np.ones(30, dtype=bool))}
+    data = {"name": "carmen", "lengths": [10.0], "apply": "end"}
+    report = report_icp(PointToLineICP(Sensor(90.0, 180.0)), steps, None, [sequence], data, tmp_path)
+    assert report["baselines"]["wheel_odometry"]["drift"] == pytest.approx(0, abs=1e-9)
+
+
+def test_mean_motion_is_that_of_all_training_drives(caplog):
+    drives = {"a": straight(3, "a"), "b": drive([(0, 0, 0), (4, 0, 0.3)], "b")}
+
+    def read(name):
+        if name not in drives:
+            raise InputError(f"{name}: no such folder")
+        return drives[name]
+
+    found = mean_motion(read, ["a", "b"])
+    np.testing.assert_allclose(found.motion, [(1 + 1 + 4) / 3, 0.1])
+    caplog.set_level("INFO")
+    assert mean_motion(read, ["a", "c"]) is None
+    assert "mean_motion is left out" in caplog.text
+    assert "c: no such folder" in caplog.text

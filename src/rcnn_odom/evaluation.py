@@ -18,21 +18,34 @@ Report = dict[str, Any]
 """Plain numbers under names, ready for JSON."""
 
 
-def camera_trajectory(sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep) -> FloatArray:
-    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files."""
-    return change_frame(compose(motions, apply), sequence.camera_from_laser)
+def camera_trajectory(
+    sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep, poses: FloatArray | None = None
+) -> FloatArray:
+    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files.
+
+    Laser poses (N, 4, 4), the first the identity, stand in place of composed motions where they are known.
+    """
+    return change_frame(compose(motions, apply) if poses is None else poses, sequence.camera_from_laser)
 
 
 def planar_drift(
-    sequence: EncodedSequence, motions: FloatArray, lengths: list[float], apply: ApplyStep
+    sequence: EncodedSequence,
+    motions: FloatArray,
+    lengths: list[float],
+    apply: ApplyStep,
+    poses: FloatArray | None = None,
 ) -> Drift:
-    """Drift of motions (N-1, 2) over one sequence, as ``rcnn-odom drift --planar`` prints it."""
-    estimate = camera_trajectory(sequence, motions, apply)
+    """Drift over one sequence, as ``rcnn-odom drift --planar`` prints it; see :func:`camera_trajectory`."""
+    estimate = camera_trajectory(sequence, motions, apply, poses)
     return drift(sequence.camera_poses, estimate, planar=True, lengths=lengths)
 
 
 def score(
-    sequence: EncodedSequence, motions: FloatArray, lengths: list[float], apply: ApplyStep = "end"
+    sequence: EncodedSequence,
+    motions: FloatArray,
+    lengths: list[float],
+    apply: ApplyStep = "end",
+    poses: FloatArray | None = None,
 ) -> Report:
     """Everything that is reported of one sequence.
 
@@ -41,6 +54,8 @@ def score(
         motions: estimated, (N-1, 2) metres and radians.
         lengths: of the drift's segments in metres.
         apply: where along its turn a step is taken, for the estimate and the floor.
+        poses: estimated laser poses (N, 4, 4), the first the identity, of a method that also knows the
+            step's sideways part; their drift is scored in place of the composed motions'.
 
     Returns:
         ``drift`` of the estimate and ``floor`` of the true motions composed the same way, both as the
@@ -48,7 +63,7 @@ def score(
     """
     return {
         "frames": len(sequence),
-        "drift": planar_drift(sequence, motions, lengths, apply).to_dict(),
+        "drift": planar_drift(sequence, motions, lengths, apply, poses).to_dict(),
         "floor": planar_drift(sequence, sequence.motions, lengths, apply).to_dict(),
         **frame_errors(motions, sequence.motions),
     }
@@ -118,13 +133,15 @@ def score_all(
     motions: Mapping[str, FloatArray],
     lengths: list[float],
     apply: ApplyStep = "end",
+    poses: Mapping[str, FloatArray] | None = None,
 ) -> Report:
-    """Scores of all sequences by name, and the means over those that have a segment.
+    """Scores of all sequences by name, and the means over those that have a segment; see :func:`score`.
 
     Returns:
         ``drift`` and ``floor`` (ratios; None without any segment) and ``sequences``.
     """
-    scores = {s.name: score(s, motions[s.name], lengths, apply) for s in sequences}
+    poses = poses or {}
+    scores = {s.name: score(s, motions[s.name], lengths, apply, poses.get(s.name)) for s in sequences}
     report: Report = {}
     for key in ("drift", "floor"):
         drifts = [one[key]["t_err"] for one in scores.values() if one[key]["segments"]]

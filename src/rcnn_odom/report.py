@@ -1,18 +1,18 @@
-"""What a run leaves behind: scores beside the baselines, trajectories, figures, the HParams row."""
+"""What a run leaves behind: scores beside the baselines, trajectories, figures."""
 
 import logging
-import re
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
 from importlib.metadata import version
 from pathlib import Path
 
-import lightning as L
 import numpy as np
 import numpy.typing as npt
 import torch
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
+from rcnn_odom.baselines.icp import PointToLineICP, Steps
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
 from rcnn_odom.figures import motion_figure, trajectory_figure
@@ -20,15 +20,35 @@ from rcnn_odom.latency import measure
 from rcnn_odom.modules import OdometryModule
 from rcnn_odom.motion import FloatArray, compose, relative_motions
 from rcnn_odom.networks import State
-from rcnn_odom.settings import Settings, flat
-from rcnn_odom.trajectory import write_kitti, write_motions, write_tum
+from rcnn_odom.settings import Settings
+from rcnn_odom.trajectory import file_name, write_kitti, write_motions, write_tum
 
 log = logging.getLogger(__name__)
 
-PACKAGES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "rcnn-odom")
+PACKAGES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "scipy", "numba", "rcnn-odom")
 LATENCY_FRAMES = 100
-Motions = dict[str, FloatArray]
+Motions = Mapping[str, FloatArray]
 """Estimated motions (N-1, 2) by the name of the sequence."""
+
+
+@dataclass(frozen=True)
+class Estimates:
+    """What one method makes of the sequences, by their name.
+
+    Attributes:
+        motions: (N-1, 2) metres and radians.
+        poses: laser poses (N, 4, 4), the first the identity, of a method that also knows the steps' sideways
+            part; they stand in place of the composed motions.
+    """
+
+    motions: Motions
+    poses: Mapping[str, FloatArray] = field(default_factory=dict)
+
+    @classmethod
+    def of_poses(cls, poses: Mapping[str, FloatArray]) -> "Estimates":
+        """Of a method that knows poses, wherever they start."""
+        at_origin = {name: np.linalg.inv(every[0]) @ every for name, every in poses.items()}
+        return cls({name: relative_motions(every) for name, every in poses.items()}, at_origin)
 
 
 def report_test(
@@ -54,22 +74,64 @@ def report_test(
         ``latency`` of the network (see :func:`rcnn_odom.latency.measure`) and ``versions`` of what computed
         them.
     """
-    baselines = baseline_motions(module, sequences)
+    mean = ConstantMotion(module.network.head.mean.double().cpu().numpy())
+    latency = measure(*stepping(module, sequences[0].scans))
+    return _report(module.variant, Estimates(motions), mean, latency, sequences, data, folder, logger)
+
+
+def report_icp(
+    icp: PointToLineICP,
+    steps: Mapping[str, Steps],
+    mean: ConstantMotion | None,
+    sequences: list[EncodedSequence],
+    data: Settings,
+    folder: Path,
+) -> Report:
+    """The same as :func:`report_test` for scan matching, whose trajectories have all of its three numbers.
+
+    Args:
+        icp: the matcher, for its latency.
+        steps: its estimates by the name of the sequence.
+        mean: the baseline ``mean_motion``; None where not all training drives could be read.
+        sequences, data, folder: as there.
+
+    Returns:
+        Also ``failures``: failed matches by the name of the sequence.
+    """
+    failures = {name: int(every.failed.sum()) for name, every in steps.items()}
+    told = ", ".join(f"{failures[name]} of {len(every.failed)} on {name}" for name, every in steps.items())
+    log.info("icp: matches that failed, for which the motion before goes on: %s", told)
+    estimates = Estimates.of_poses({name: every.poses for name, every in steps.items()})
+    latency = measure(*icp_stepping(icp, sequences[0].scans))
+    return {**_report("icp", estimates, mean, latency, sequences, data, folder, None), "failures": failures}
+
+
+def _report(
+    name: str,
+    estimates: Estimates,
+    mean: ConstantMotion | None,
+    latency: Report,
+    sequences: list[EncodedSequence],
+    data: Settings,
+    folder: Path,
+    logger: TensorBoardLogger | None,
+) -> Report:
+    """Scores, files and figures of one method beside the baselines."""
+    baselines = baseline_estimates(mean, sequences)
     reports = {
-        method: score_all(sequences, estimated, data["lengths"], data["apply"])
-        for method, estimated in {module.variant: motions, **baselines}.items()
+        method: score_all(sequences, every.motions, data["lengths"], data["apply"], every.poses)
+        for method, every in {name: estimates, **baselines}.items()
     }
     log.info("\n%s\n", table(reports))
-    test = reports.pop(module.variant)
+    test = reports.pop(name)
     for sequence in sequences:
         drift = percent(test["sequences"][sequence.name]["drift"]["t_err"])
-        title = f"{module.variant} on {data['name']} {sequence.name}: drift {drift} %"
-        others = {method: estimated[sequence.name] for method, estimated in baselines.items()}
-        write_sequence(sequence, motions[sequence.name], others, title, data, folder, logger)
+        title = f"{name} on {data['name']} {sequence.name}: drift {drift} %"
+        others = {method: every.motions[sequence.name] for method, every in baselines.items()}
+        write_sequence(sequence, estimates, others, title, data, folder, logger)
     versions = {package: version(package) for package in PACKAGES}
-    latency = measure(*stepping(module, sequences[0].scans))
     times = latency["median_ms"], latency["p99_ms"]
-    log.info("%s: %.2f ms a frame, 99th percentile %.2f, on one thread", module.variant, *times)
+    log.info("%s: %.2f ms a frame, 99th percentile %.2f, on one thread", name, *times)
     return {"test": test, "baselines": reports, "latency": latency, "versions": versions}
 
 
@@ -93,20 +155,45 @@ def stepping(module: OdometryModule, scans: npt.NDArray[np.float32]) -> tuple[Ca
     return step, len(tensor) - 1
 
 
-def baseline_motions(module: OdometryModule, sequences: list[EncodedSequence]) -> dict[str, Motions]:
-    """What the baselines estimate, by their name; wheel odometry where every log has it."""
-    mean = ConstantMotion(module.network.head.mean.double().cpu().numpy())
+def icp_stepping(icp: PointToLineICP, scans: npt.NDArray[np.float32]) -> tuple[Callable[[int], object], int]:
+    """The same as :func:`stepping` for scan matching, from a depth vector to a step."""
+    scans = np.array(scans[: LATENCY_FRAMES + 1])
+    earlier, guess = icp.outline(scans[0]), np.zeros(3)
+
+    def step(frame: int) -> object:
+        nonlocal earlier, guess
+        if frame == 1:
+            earlier, guess = icp.outline(scans[0]), np.zeros(3)
+        later = icp.outline(scans[frame])
+        match = icp.match(earlier, later, guess)
+        earlier, guess = later, match.step
+        return match
+
+    return step, len(scans) - 1
+
+
+def baseline_estimates(mean: ConstantMotion | None, sequences: list[EncodedSequence]) -> dict[str, Estimates]:
+    """What the baselines estimate, by their name; wheel odometry where every log has it.
+
+    Args:
+        mean: the baseline ``mean_motion``, which is left out without one.
+        sequences: to estimate.
+    """
+    constant = {"mean_motion": mean} if mean else {}
+    constant["held_motion"] = held_motion()
     baselines = {
-        name: {sequence.name: baseline.estimate(sequence.scans) for sequence in sequences}
-        for name, baseline in (("mean_motion", mean), ("held_motion", held_motion()))
+        name: Estimates({sequence.name: baseline.estimate(sequence.scans) for sequence in sequences})
+        for name, baseline in constant.items()
     }
-    wheels = {s.name: relative_motions(s.wheel_odometry) for s in sequences if s.wheel_odometry is not None}
-    return baselines | ({"wheel_odometry": wheels} if len(wheels) == len(sequences) else {})
+    wheels = {s.name: s.wheel_odometry for s in sequences if s.wheel_odometry is not None}
+    return baselines | (
+        {"wheel_odometry": Estimates.of_poses(wheels)} if len(wheels) == len(sequences) else {}
+    )
 
 
 def write_sequence(
     sequence: EncodedSequence,
-    motions: FloatArray,
+    estimates: Estimates,
     baselines: dict[str, FloatArray],
     title: str,
     data: Settings,
@@ -114,29 +201,21 @@ def write_sequence(
     logger: TensorBoardLogger | None,
 ) -> None:
     """One sequence's trajectory in KITTI and TUM format, its truth, motions, and the paper's two figures."""
-    name = re.sub(r"[^\w.-]+", "_", sequence.name.replace(":", "-")).strip("_")
+    name = file_name(sequence.name)
     for kind in ("trajectories", "figures"):
         (folder / kind).mkdir(parents=True, exist_ok=True)
-    poses = camera_trajectory(sequence, motions, data["apply"])
-    write_kitti(folder / "trajectories" / f"{name}.txt", poses)
+    motions = estimates.motions[sequence.name]
+    poses = estimates.poses.get(sequence.name, compose(motions, data["apply"]))
+    camera_poses = camera_trajectory(sequence, motions, data["apply"], poses)
+    write_kitti(folder / "trajectories" / f"{name}.txt", camera_poses)
     write_kitti(folder / "trajectories" / f"{name}_truth.txt", sequence.camera_poses)
-    write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, poses)
+    write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, camera_poses)
     write_motions(folder / "trajectories" / f"{name}_motions.csv", motions, sequence.motions, baselines)
     figures = {
-        "trajectory": trajectory_figure(title, sequence.poses, compose(motions, data["apply"])),
+        "trajectory": trajectory_figure(title, sequence.poses, poses),
         "motion": motion_figure(title, sequence.motions, motions),
     }
     for kind, figure in figures.items():
         figure.savefig(folder / "figures" / f"{name}_{kind}.png", dpi=120)
         if logger is not None:
             logger.experiment.add_figure(f"test/{name}_{kind}", figure)
-
-
-def log_hyperparameters(trainer: L.Trainer, settings: Settings, metrics: Report) -> None:
-    """The row of TensorBoard's HParams tab: every setting, and drift as its metric."""
-    row = {name: str(value) if isinstance(value, list) else value for name, value in flat(settings).items()}
-    # Under names of their own: as more points of val/drift they would purge that curve.
-    scores = {"val/best_drift": metrics["val"]["drift"], "test/drift": metrics["test"]["drift"]}
-    known = {name: value for name, value in scores.items() if value is not None}
-    assert isinstance(trainer.logger, TensorBoardLogger)
-    trainer.logger.log_hyperparams(row, known, trainer.global_step)

@@ -1,11 +1,19 @@
 """Constant motion: what a drift is worth that no laser has contributed to."""
 
+import logging
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
+from rcnn_odom.cache import EncodedSequence
+from rcnn_odom.datamodule import cut, parse_part
+from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray
+
+log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -29,3 +37,25 @@ def held_motion() -> ConstantMotion:
     It is what a matcher that holds its last motion on failure amounts to when it fails from the start.
     """
     return ConstantMotion(np.zeros(2))
+
+
+def mean_motion(read: Callable[[str], Sequence], names: list[str]) -> ConstantMotion | None:
+    """Repeats the mean motion of training drives; None, and a line in the log, where one cannot be read.
+
+    Args:
+        read: name -> ``Sequence``, of which the truth is needed and no scan.
+        names: of the drives or of parts of them, as in ``data.train``.
+    """
+    try:
+        motions = [_without_scans(read, name).motions for name in names]
+    except InputError as error:
+        log.info("mean_motion is left out, since not all of data.train can be read: %s", error)
+        return None
+    return ConstantMotion(np.concatenate(motions).mean(0))
+
+
+def _without_scans(read: Callable[[str], Sequence], name: str) -> EncodedSequence:
+    drive = read(parse_part(name)[0])
+    scans = np.empty((len(drive), 0), dtype=np.float32)
+    whole = EncodedSequence(drive.name, "", scans, drive.poses, drive.stamps, drive.camera_from_laser)
+    return cut({drive.name: whole}, name)
