@@ -30,6 +30,7 @@ def settings(variant, **changes):
         "kernel_size": 3,
         "pooling": "avg",
         "angle": "expectation",
+        "dropout": 0.0,
         "rotation_classes": {"count": 112, "width_deg": 0.1},
         "beta": 1.0 if variant.endswith("cls") else 100.0,
         "per_sample_norm": False,

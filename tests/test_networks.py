@@ -282,3 +282,26 @@ def test_rcnn_depends_on_the_pairs_before():
     alone, _ = network(pairs[:, 2:])
     after_two, _ = network(pairs)
     assert not torch.allclose(alone.motion[:, 0], after_two.motion[:, 2], atol=1e-4)
+
+
+def test_dropout_hides_features_while_training_only():
+    torch.manual_seed(0)
+    bins, pairs = 361, torch.rand(2, 3, 2, 361)
+    for plain, dropping in (
+        (CNN(bins, 80.0, None), CNN(bins, 80.0, None, dropout=0.5)),
+        (
+            RCNN(CNN(bins, 80.0, None), None, hidden=8),
+            RCNN(CNN(bins, 80.0, None), None, hidden=8, dropout=0.5),
+        ),
+    ):
+        dropping.load_state_dict(plain.state_dict())
+        expected = plain(pairs)[0].motion
+        assert not torch.equal(dropping(pairs)[0].motion, dropping(pairs)[0].motion)
+        assert torch.equal(dropping.eval()(pairs)[0].motion, expected)
+        head = plain.head
+        # Half of the inputs are hidden and the others doubled: the mean stays.
+        inputs = plain.encode(pairs) if isinstance(plain, CNN) else None
+        if inputs is not None:
+            dropping.train()
+            mean = torch.stack([dropping(pairs)[0].motion for _ in range(2000)]).mean(0)
+            torch.testing.assert_close(mean, head(inputs).motion, atol=0.1, rtol=0.05)
