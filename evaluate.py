@@ -87,11 +87,10 @@ def _match_scans(chosen: dict) -> tuple[dict, dict]:
     names = data["train"], data["val"], data["test"]
     datamodule = OdometryDataModule(read, *names, sensor, cache, workers=data["workers"]).load(("test",))
     sequences = datamodule.sequences["test"]
+    mean = mean_motion(read, data["train"])
     steps = {sequence.name: icp.estimate(sequence.scans) for sequence in sequences}
-    report = report_icp(
-        icp, steps, mean_motion(read, data["train"]), sequences, data, Path(chosen["run_dir"])
-    )
-    settings = {key: value for key, value in chosen.items() if key != "run"}
+    report = report_icp(icp, steps, mean, sequences, data, Path(chosen["run_dir"]))
+    settings = {key: value for key, value in chosen.items() if key not in ("run", "trainer")}
     return settings, {"variant": "icp", "data": data["name"], **report}
 
 

@@ -29,7 +29,7 @@ def test_scan_matching_leaves_what_a_trained_run_leaves(evaluate_icp, tmp_path, 
     folder = tmp_path / "outputs" / "icp"
     assert json.loads((folder / "metrics.json").read_text()) == metrics
     assert (metrics["variant"], metrics["data"]) == ("icp", "simulated")
-    assert set(metrics["baselines"]) == {"mean_motion", "held_motion"}
+    assert set(metrics["baselines"]) == {"mean_motion", "held_motion", "icp_two_numbers"}
     assert set(metrics["latency"]) == {"median_ms", "p99_ms", "frames", "threads"}
     assert metrics["failures"] == {"05": 0}
     assert "0 of 29 on 05" in caplog.text
@@ -52,7 +52,7 @@ def test_a_robots_log_beside_its_wheels_and_the_command_line(evaluate_icp, tmp_p
     options = ["data=carmen", f"data.root={tmp_path}/logs", "data.train=[missing]", "data.test=[robot]"]
     metrics = evaluate_icp(*options, "data.lengths=[1.0,2.0]", "data.workers=1")
     # The training logs are not there, so there is no mean motion.
-    assert set(metrics["baselines"]) == {"held_motion", "wheel_odometry"}
+    assert set(metrics["baselines"]) == {"held_motion", "wheel_odometry", "icp_two_numbers"}
     trajectories = tmp_path / "outputs" / "icp" / "trajectories"
     camera = read_kitti(trajectories / "robot.txt")
     found = poses_to_planar(change_frame(camera, np.linalg.inv(FORWARD_CAMERA)))

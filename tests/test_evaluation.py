@@ -309,7 +309,7 @@ def test_the_report_of_scan_matching_has_whole_poses_failures_and_no_mean_motion
     assert report["failures"] == {"05": 4}
     assert "4 of 30 on 05" in caplog.text
     assert report["test"]["drift"] == pytest.approx(0, abs=1e-9)
-    assert list(report["baselines"]) == ["held_motion"]
+    assert list(report["baselines"]) == ["held_motion", "icp_two_numbers"]
     assert report["latency"]["frames"] == 30
     assert {"numpy", "scipy", "numba"} <= set(report["versions"])
     camera = read_kitti(tmp_path / "trajectories" / "05.txt")

@@ -199,3 +199,13 @@ def test_real_frames_of_a_velodyne(tmp_path):
     assert np.abs(error).mean() < 0.02
     assert abs(error.mean()) < 0.01
     assert np.abs(found.steps[:, 2] - sequence.motions[:, 1]).mean() < np.deg2rad(0.02)
+
+
+@pytest.mark.parametrize("hidden", [60, 70])
+def test_other_guesses_keep_the_last_motion_along_a_corridor(hidden):
+    icp, guess = PointToLineICP(ROBOT), np.array([0.3, 0.0, 0.0])
+    earlier, later = (look(LONG_CORRIDOR, (x, 0.0, 0.0), ROBOT) for x in (0.0, 0.3))
+    later[-hidden:] = 0.5  # someone stands beside the robot, and the overlap becomes doubtful
+    found = icp.match(icp.outline(earlier), icp.outline(later), guess)
+    assert found.failed
+    np.testing.assert_allclose(found.step, guess, atol=1e-6)

@@ -8,9 +8,11 @@ import pytest
 from conftest import ROOT
 from data.make_carmen import make_carmen
 from rcnn_odom.cli import main
+from rcnn_odom.cli import relations as cli_relations
 from rcnn_odom.datasets import carmen
 from rcnn_odom.errors import InputError
 from rcnn_odom.metrics.relations import (
+    LOOP_PATH,
     Relations,
     find_scans,
     read_relations,
@@ -200,7 +202,7 @@ def test_tum_is_read_as_it_was_written(tmp_path):
     np.testing.assert_allclose(read_stamps, stamps, atol=1e-6)
     np.testing.assert_allclose(read_poses, poses, atol=1e-8)
     (tmp_path / "b.tum").write_text("0 1 2 3 0 0 0 2\n")
-    with pytest.raises(InputError, match=r"b\.tum:1: the last four numbers are no unit quaternion"):
+    with pytest.raises(InputError, match=r"b\.tum: the pose of .* s has no unit quaternion"):
         read_tum(tmp_path / "b.tum")
 
 
@@ -219,3 +221,14 @@ def test_wheel_odometry_of_a_real_log():
     scans = find_scans(relations, stamp_keys(log.stamps))
     way = np.abs(np.diff(driven[scans], axis=1))
     assert not ((way > 1) & (way < 10)).any()
+
+
+def test_comments_in_a_tum_file_are_skipped(tmp_path):
+    (tmp_path / "a.tum").write_text("# stamp x y z qx qy qz qw\n1.5 1 2 3 0 0 0 1\n")
+    stamps, poses = read_tum(tmp_path / "a.tum")
+    assert stamps.tolist() == [1.5]
+    assert poses[0, :3, 3].tolist() == [1, 2, 3]
+
+
+def test_the_help_tells_the_default_of_the_metric():
+    assert cli_relations.LOOP_PATH == LOOP_PATH

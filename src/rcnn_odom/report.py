@@ -14,11 +14,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.baselines.icp import PointToLineICP, Steps
 from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.evaluation import Report, camera_trajectory, percent, score_all, table
+from rcnn_odom.evaluation import Report, percent, score_all, table
 from rcnn_odom.figures import motion_figure, trajectory_figure
 from rcnn_odom.latency import measure
 from rcnn_odom.modules import OdometryModule
-from rcnn_odom.motion import FloatArray, compose, relative_motions
+from rcnn_odom.motion import FloatArray, change_frame, compose, relative_motions
 from rcnn_odom.networks import State
 from rcnn_odom.settings import Settings
 from rcnn_odom.trajectory import file_name, write_kitti, write_motions, write_tum
@@ -100,7 +100,9 @@ def report_icp(
     """
     failures = {name: int(every.failed.sum()) for name, every in steps.items()}
     told = ", ".join(f"{failures[name]} of {len(every.failed)} on {name}" for name, every in steps.items())
-    log.info("icp: matches that failed, for which the motion before goes on: %s", told)
+    log.info(
+        "icp: scans that do not overlap or leave a direction open, where the last motion goes on: %s", told
+    )
     estimates = Estimates.of_poses({name: every.poses for name, every in steps.items()})
     latency = measure(*icp_stepping(icp, sequences[0].scans))
     return {**_report("icp", estimates, mean, latency, sequences, data, folder, None), "failures": failures}
@@ -122,6 +124,10 @@ def _report(
         method: score_all(sequences, every.motions, data["lengths"], data["apply"], every.poses)
         for method, every in {name: estimates, **baselines}.items()
     }
+    if estimates.poses:  # beside whole poses, what networks can say: comparable with them and with the floor
+        reports[f"{name}_two_numbers"] = score_all(
+            sequences, estimates.motions, data["lengths"], data["apply"]
+        )
     log.info("\n%s\n", table(reports))
     test = reports.pop(name)
     for sequence in sequences:
@@ -206,7 +212,7 @@ def write_sequence(
         (folder / kind).mkdir(parents=True, exist_ok=True)
     motions = estimates.motions[sequence.name]
     poses = estimates.poses.get(sequence.name, compose(motions, data["apply"]))
-    camera_poses = camera_trajectory(sequence, motions, data["apply"], poses)
+    camera_poses = change_frame(poses, sequence.camera_from_laser)
     write_kitti(folder / "trajectories" / f"{name}.txt", camera_poses)
     write_kitti(folder / "trajectories" / f"{name}_truth.txt", sequence.camera_poses)
     write_tum(folder / "trajectories" / f"{name}.tum", sequence.stamps, camera_poses)

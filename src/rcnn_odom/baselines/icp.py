@@ -172,14 +172,14 @@ class PointToLineICP:
 
         Where the guess leads to a poor overlap, rest and turns on the spot are tried as well.
         """
-        best = self._align(earlier, later, guess)
+        best = self._align(earlier, later, guess, guess)
         if best.share < DOUBTFUL_SHARE:
-            others = [self._align(earlier, later, np.array([0.0, 0.0, turn])) for turn in OTHER_TURNS]
-            best = max([best, *others], key=lambda match: match.share)
+            others = [self._align(earlier, later, np.array([0.0, 0.0, turn]), guess) for turn in OTHER_TURNS]
+            best = max([best, *others], key=lambda match: (not match.failed, match.share))
         return best if best.share >= LEAST_SHARE else Match(guess, True, best.share)
 
-    def _align(self, earlier: Outline, later: Outline, guess: FloatArray) -> Match:
-        """One descent by Gauss-Newton, from one guess, which stands along directions that are not determined.
+    def _align(self, earlier: Outline, later: Outline, start: FloatArray, guess: FloatArray) -> Match:
+        """One descent by Gauss-Newton from a start; the guess stands along undetermined directions.
 
         Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016;
         but only at the end: few walls may say enough once their points have found each other.
@@ -188,7 +188,7 @@ class PointToLineICP:
         if earlier.tree is None or len(later.chosen) < FEWEST_PAIRS:
             return nothing
         points, normals = later.points[later.chosen], later.normals[later.chosen]
-        step, gate = np.array(guess, dtype=np.float64), self.max_distance
+        step, gate = np.array(start, dtype=np.float64), self.max_distance
         for _ in range(self.max_iterations):
             turn = planar_to_poses(step[None])[0, :2, :2]
             turned = points @ turn.T

@@ -74,6 +74,8 @@ def _run_relations(arguments: argparse.Namespace) -> int:
     from rcnn_odom.metrics.relations import read_relations, score_relations, stamp_keys
     from rcnn_odom.motion import FORWARD_CAMERA, change_frame
 
+    if not arguments.log.is_file():
+        raise InputError(f"{arguments.log}: no such file; give the log that the relations are of")
     relations = read_relations(arguments.relations)
     log = carmen.load(arguments.log.name, root=arguments.log.parent)
     stamps = stamp_keys(log.stamps)
@@ -117,7 +119,7 @@ def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "Floa
 def _count_columns(path: Path) -> int:
     try:
         with path.open(encoding="utf-8", errors="replace") as stream:
-            return len(stream.readline().split())
+            return next((len(line.split()) for line in stream if not line.startswith("#")), 0)
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
 

@@ -135,6 +135,8 @@ class Beams:
 def _find_log(root: Path, name: str) -> Path:
     if not root.is_dir():
         raise InputError(f"{root}: no such folder; set data.root to the folder of the log")
+    if (root / name).is_file():
+        return root / name
     found = [root / (name + suffix) for suffix in SUFFIXES if (root / (name + suffix)).is_file()]
     if not found:
         raise InputError(

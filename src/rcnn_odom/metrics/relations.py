@@ -64,7 +64,10 @@ def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
     rows = _read_numbers(path, 8, "a TUM pose has 8 numbers, stamp x y z qx qy qz qw")
     strange = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > 0.01)
     if len(strange):
-        raise InputError(f"{path}:{strange[0] + 1}: the last four numbers are no unit quaternion; correct it")
+        raise InputError(
+            f"{path}: the pose of {rows[strange[0], 0]:.6f} s has no unit quaternion as its last four "
+            "numbers; correct it"
+        )
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
     poses[:, :3, 3] = rows[:, 1:4]
@@ -78,8 +81,10 @@ def _read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not lines:
         raise InputError(f"{path}: is empty; {wanted}")
-    rows = np.empty((len(lines), columns))
+    rows = []
     for number, line in enumerate(lines):
+        if line.startswith("#"):
+            continue
         try:
             row = [float(word) for word in line.split()]
         except ValueError:
@@ -88,8 +93,10 @@ def _read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
             raise InputError(
                 f"{path}:{number + 1}: found '{line.strip()[:40]}', but {wanted}; correct the line"
             )
-        rows[number] = row
-    return rows
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: has comments alone; {wanted}")
+    return np.array(rows)
 
 
 def find_scans(relations: Relations, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
