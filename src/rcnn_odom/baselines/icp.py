@@ -175,7 +175,7 @@ class PointToLineICP:
         best = self._align(earlier, later, guess, guess)
         if best.share < DOUBTFUL_SHARE:
             others = [self._align(earlier, later, np.array([0.0, 0.0, turn]), guess) for turn in OTHER_TURNS]
-            best = max([best, *others], key=lambda match: (not match.failed, match.share))
+            best = max([best, *others], key=lambda match: match.share)
         return best if best.share >= LEAST_SHARE else Match(guess, True, best.share)
 
     def _align(self, earlier: Outline, later: Outline, start: FloatArray, guess: FloatArray) -> Match:
