@@ -6,6 +6,8 @@ from pathlib import Path
 import pytest
 from hydra import compose, initialize_config_dir
 
+from data.make_kitti import make_kitti
+
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
 
@@ -22,6 +24,17 @@ SMALL_RECURRENT = [
     "model.first_stage.epochs=1",
     "model.first_stage.batch_size=8",
 ]
+
+
+LENGTHS = "data.lengths=[10.0,20.0]"
+
+
+@pytest.fixture(scope="session")
+def kitti(tmp_path_factory):
+    """Options for three tiny drives in KITTI's layout."""
+    root = tmp_path_factory.mktemp("kitti")
+    make_kitti(root, ["00", "10", "05"], frames=60)
+    return [f"data.root={root}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
 
 
 @pytest.fixture

@@ -13,9 +13,8 @@ import yaml
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from conftest import ROOT
+from conftest import LENGTHS, ROOT
 from data.make_carmen import make_carmen
-from data.make_kitti import make_kitti
 from evaluate import evaluate
 from rcnn_odom import cli, experiment
 from rcnn_odom.errors import InputError
@@ -27,14 +26,6 @@ from rcnn_odom.settings import plain
 from train import train
 
 VARIANTS = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
-LENGTHS = "data.lengths=[10.0,20.0]"
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory):
-    root = tmp_path_factory.mktemp("kitti")
-    make_kitti(root, ["00", "10", "05"], frames=60)
-    return [f"data.root={root}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
 
 
 @pytest.mark.parametrize("variant", VARIANTS)

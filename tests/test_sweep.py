@@ -14,20 +14,10 @@ import pytest
 import yaml
 
 from conftest import ROOT
-from data.make_kitti import make_kitti
 from rcnn_odom.lock import one_at_a_time
 from rcnn_odom.runs import BEST, LAST
 from rcnn_odom.sweep import LONGEST_NAME, expected_folders, folder_name
 from train import train
-
-LENGTHS = "data.lengths=[10.0,20.0]"
-
-
-@pytest.fixture(scope="module")
-def kitti(tmp_path_factory):
-    root = tmp_path_factory.mktemp("kitti")
-    make_kitti(root, ["00", "10", "05"], frames=60)
-    return [f"data.root={root}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
 
 
 @pytest.fixture
