@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+import yaml
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.summary import load_runs, runs_table
@@ -158,9 +159,25 @@ def test_a_first_stage_belongs_to_its_run(tmp_path):
     assert list(table["first_stage_seconds"]) == [33.0]
 
 
+def forget_seed(run):
+    settings = yaml.safe_load((run / "config.yaml").read_text())
+    settings.pop("seed")
+    (run / "config.yaml").write_text(yaml.safe_dump(settings))
+
+
+def test_a_training_without_a_seed_is_damaged(tmp_path):
+    finish_run(tmp_path / "a", ["seed=0"], DRIFTS, seed=0)
+    finish_run(tmp_path / "b", ["seed=1"], DRIFTS, seed=1)
+    forget_seed(tmp_path / "b")
+    table = load_runs(tmp_path)
+    assert table["status"].tolist() == ["finished", "damaged"]
+    assert table["problem"][1] == "config.yaml has no seed"
+
+
 def test_evaluations_are_no_runs(tmp_path):
     finish_run(tmp_path / "a", ["seed=0"], DRIFTS)
     finish_run(tmp_path / "b" / "icp", ["run=a"], DRIFTS, seed=None, variant="icp")
+    forget_seed(tmp_path / "b" / "icp")  # scan matching has none
     other = {"data.test": ["00"]}
     finish_run(tmp_path / "b" / "other", ["run=a"], {"05": 0.1}, other, seed=None, variant="icp")
     begin_run(tmp_path / "b" / "stopped", ["run=a"])

@@ -95,7 +95,11 @@ def read_run(folder: Path, name: str) -> Run:
         if not run.settings:
             return replace(run, status="damaged", problem=f"{CONFIG} cannot be read")
     if (folder / METRICS).exists():
-        return _read_finished(run)
+        run = _read_finished(run)
+    if run.settings and "seed" not in run.settings and not run.is_evaluation:
+        return replace(run, status="damaged", problem=f"{CONFIG} has no seed", settings={})
+    if (folder / METRICS).exists():
+        return run
     if (folder / ERROR).exists():
         return replace(run, status="failed", problem=_one_line(folder / ERROR))
     ended = "stopped, or still running" if run.settings else f"ended before its {CONFIG} was written"
@@ -108,7 +112,7 @@ def _read_settings(path: Path) -> Settings:
         settings = yaml.safe_load(path.read_text())
     except (OSError, yaml.YAMLError, UnicodeDecodeError):
         return {}
-    is_run = isinstance(settings, dict) and {"data", "model", "seed"} <= settings.keys()
+    is_run = isinstance(settings, dict) and {"data", "model"} <= settings.keys()
     return flat(settings) if is_run else {}
 
 
