@@ -25,7 +25,7 @@ from rcnn_odom.evaluation import (
     stretch_errors,
     table,
 )
-from rcnn_odom.motion import FORWARD_CAMERA, planar_to_poses
+from rcnn_odom.motion import FORWARD_CAMERA, compose, planar_to_poses
 from rcnn_odom.report import report_icp, report_test
 from rcnn_odom.scan import Sensor
 from rcnn_odom.trajectory import read_kitti, read_motions, write_motions
@@ -123,7 +123,7 @@ def test_camera_beside_the_laser_does_not_change_exact_motion():
     angles = np.linspace(0, 3, 61)
     planar = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
     sequence = drive(planar, camera_from_laser=shifted)
-    exact = planar_drift(sequence, sequence.motions, [5.0, 10.0], "middle")
+    exact = planar_drift(sequence, compose(sequence.motions, "middle"), [5.0, 10.0])
     assert exact.segments > 5
     assert exact.t_err == pytest.approx(0, abs=1e-9)
 

@@ -11,19 +11,19 @@ from rcnn_odom.cli import main
 from rcnn_odom.cli import relations as cli_relations
 from rcnn_odom.datasets import carmen
 from rcnn_odom.errors import InputError
+from rcnn_odom.metrics.drift import travelled
 from rcnn_odom.metrics.relations import (
     LOOP_PATH,
     Relations,
     find_scans,
     read_relations,
-    read_tum,
     relation_errors,
     score_relations,
     stamp_keys,
     summarise,
 )
 from rcnn_odom.motion import FORWARD_CAMERA, change_frame, planar_to_poses
-from rcnn_odom.trajectory import write_kitti, write_tum
+from rcnn_odom.trajectory import read_tum, write_kitti, write_tum
 
 REAL = ROOT.parent / "shared" / "data" / "carmen"
 FRAMES = 60
@@ -232,3 +232,15 @@ def test_comments_in_a_tum_file_are_skipped(tmp_path):
 
 def test_the_help_tells_the_default_of_the_metric():
     assert cli_relations.LOOP_PATH == LOOP_PATH
+
+
+@pytest.mark.skipif(not REAL.is_dir(), reason=f"no real logs in {REAL}")
+@pytest.mark.parametrize("log", ["aces", "intel"])
+def test_loops_lie_far_from_sequential_relations_on_real_logs(log):
+    relations = read_relations(REAL / "relations" / f"{log}.relations")
+    drive = carmen.load(log, root=REAL)
+    scans = find_scans(relations, stamp_keys(drive.stamps))
+    first, second = travelled(drive.wheel_odometry)[scans[(scans >= 0).all(1)]].T
+    way = np.abs(second - first)
+    assert way[way < LOOP_PATH].max() < 0.6
+    assert way[way > LOOP_PATH].min() > 10

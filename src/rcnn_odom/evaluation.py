@@ -1,6 +1,6 @@
 """Scores of estimated motions: drift, its floor, and the errors of single frames; files of motions."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -18,25 +18,14 @@ Report = dict[str, Any]
 """Plain numbers under names, ready for JSON."""
 
 
-def camera_trajectory(
-    sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep, poses: FloatArray | None = None
-) -> FloatArray:
-    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files.
-
-    Laser poses (N, 4, 4), the first the identity, stand in place of composed motions where they are known.
-    """
-    return change_frame(compose(motions, apply) if poses is None else poses, sequence.camera_from_laser)
+def camera_trajectory(sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep) -> FloatArray:
+    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files."""
+    return change_frame(compose(motions, apply), sequence.camera_from_laser)
 
 
-def planar_drift(
-    sequence: EncodedSequence,
-    motions: FloatArray,
-    lengths: list[float],
-    apply: ApplyStep,
-    poses: FloatArray | None = None,
-) -> Drift:
-    """Drift over one sequence, as ``rcnn-odom drift --planar`` prints it; see :func:`camera_trajectory`."""
-    estimate = camera_trajectory(sequence, motions, apply, poses)
+def planar_drift(sequence: EncodedSequence, poses: FloatArray, lengths: list[float]) -> Drift:
+    """Drift of laser poses (N, 4, 4) over one sequence, as ``rcnn-odom drift --planar`` prints it."""
+    estimate = change_frame(poses, sequence.camera_from_laser)
     return drift(sequence.camera_poses, estimate, planar=True, lengths=lengths)
 
 
@@ -61,10 +50,11 @@ def score(
         ``drift`` of the estimate and ``floor`` of the true motions composed the same way, both as the
         command line prints them, and the errors of single frames.
     """
+    poses = compose(motions, apply) if poses is None else poses
     return {
         "frames": len(sequence),
-        "drift": planar_drift(sequence, motions, lengths, apply, poses).to_dict(),
-        "floor": planar_drift(sequence, sequence.motions, lengths, apply).to_dict(),
+        "drift": planar_drift(sequence, poses, lengths).to_dict(),
+        "floor": planar_drift(sequence, compose(sequence.motions, apply), lengths).to_dict(),
         **frame_errors(motions, sequence.motions),
     }
 
@@ -165,6 +155,11 @@ def table(reports: Mapping[str, Report]) -> str:
         rows.append([method, *map(percent, drifts), percent(report["drift"])])
     segments = [first["sequences"][name]["drift"]["segments"] for name in names]
     rows.append(["segments", *map(str, segments), ""])
+    return aligned(rows)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> str:
+    """Rows of cells for a terminal, the first column to the left, the others to the right."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for label, *cells in rows:

@@ -32,16 +32,21 @@ def read_kitti(path: str | Path) -> FloatArray:
         InputError: the file cannot be read or is empty, or a line (which is named) does not hold
             12 finite numbers with a rotation among them.
     """
+    lines = _read_lines(path, "give a file with 12 numbers a line, one line a frame")
+    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    for number, line in enumerate(lines, start=1):
+        poses[number - 1, :3] = _parse_row(line, f"{path}:{number}")
+    return poses
+
+
+def _read_lines(path: str | Path, wanted: str) -> list[str]:
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}") from error
     if not lines:
-        raise InputError(f"{path}: is empty: give a file with 12 numbers a line, one line a frame")
-    poses = np.tile(np.eye(4), (len(lines), 1, 1))
-    for number, line in enumerate(lines, start=1):
-        poses[number - 1, :3] = _parse_row(line, f"{path}:{number}")
-    return poses
+        raise InputError(f"{path}: is empty; {wanted}")
+    return lines
 
 
 def _parse_row(line: str, where: str) -> FloatArray:
@@ -58,6 +63,62 @@ def _parse_row(line: str, where: str) -> FloatArray:
     if abs(np.linalg.det(pose[:, :3]) - 1) > 0.01:
         raise InputError(f"{where}: the 3x3 part of a pose must be a rotation, and this one is not")
     return pose
+
+
+def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
+    """Read lines of ``stamp x y z qx qy qz qw``, as :func:`write_tum` writes them; # begins a comment.
+
+    Returns:
+        Stamps (N,) in seconds and poses (N, 4, 4).
+
+    Raises:
+        InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
+            finite numbers with a quaternion of unit length among them.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rows = read_numbers(path, 8, "a TUM pose has 8 numbers, stamp x y z qx qy qz qw")
+    strange = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > 0.01)
+    if len(strange):
+        raise InputError(
+            f"{path}: the pose of {rows[strange[0], 0]:.6f} s has no unit quaternion as its last four "
+            "numbers; correct it"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses
+
+
+def read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
+    """Lines of so many numbers as rows (N, columns), N >= 1; lines that begin with # are comments.
+
+    Args:
+        path: of the text file.
+        columns: numbers a line.
+        wanted: what a line should hold, for the message.
+
+    Raises:
+        InputError: the file cannot be read or holds no line, or a line (which is named) does not hold so
+            many finite numbers.
+    """
+    lines = _read_lines(path, wanted)
+    rows = []
+    for number, line in enumerate(lines):
+        if line.startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise InputError(
+                f"{path}:{number + 1}: found '{line.strip()[:40]}', but {wanted}; correct the line"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: has comments alone; {wanted}")
+    return np.array(rows)
 
 
 def write_kitti(path: str | Path, poses: npt.ArrayLike) -> None:

@@ -93,8 +93,8 @@ def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "Floa
     """Poses (N, 4, 4) for all stamps (N,) of the log, nan where the file has none."""
     import numpy as np
 
-    from rcnn_odom.metrics.relations import read_tum, stamp_keys
-    from rcnn_odom.trajectory import read_kitti
+    from rcnn_odom.metrics.relations import stamp_keys
+    from rcnn_odom.trajectory import read_kitti, read_tum
 
     if _count_columns(path) != TUM_COLUMNS:
         poses = read_kitti(path)

@@ -13,6 +13,7 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, planar_to_poses
+from rcnn_odom.trajectory import read_numbers
 
 LOOP_PATH = 5.0
 """Metres driven between two scans, from which on their relation closes a loop. The others follow the robot
@@ -45,58 +46,8 @@ def read_relations(path: str | Path) -> Relations:
         InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
             finite numbers.
     """
-    rows = _read_numbers(path, 8, "a relation has 8 numbers, t1 t2 x y z roll pitch yaw")
+    rows = read_numbers(path, 8, "a relation has 8 numbers, t1 t2 x y z roll pitch yaw")
     return Relations(stamp_keys(rows[:, :2]), rows[:, [2, 3, 7]])
-
-
-def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
-    """Read lines of ``stamp x y z qx qy qz qw``, as ``rcnn_odom.trajectory.write_tum`` writes them.
-
-    Returns:
-        Stamps (N,) in seconds and poses (N, 4, 4).
-
-    Raises:
-        InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
-            finite numbers with a quaternion of unit length among them.
-    """
-    from scipy.spatial.transform import Rotation
-
-    rows = _read_numbers(path, 8, "a TUM pose has 8 numbers, stamp x y z qx qy qz qw")
-    strange = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > 0.01)
-    if len(strange):
-        raise InputError(
-            f"{path}: the pose of {rows[strange[0], 0]:.6f} s has no unit quaternion as its last four "
-            "numbers; correct it"
-        )
-    poses = np.tile(np.eye(4), (len(rows), 1, 1))
-    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
-    poses[:, :3, 3] = rows[:, 1:4]
-    return rows[:, 0], poses
-
-
-def _read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
-    try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    if not lines:
-        raise InputError(f"{path}: is empty; {wanted}")
-    rows = []
-    for number, line in enumerate(lines):
-        if line.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(
-                f"{path}:{number + 1}: found '{line.strip()[:40]}', but {wanted}; correct the line"
-            )
-        rows.append(row)
-    if not rows:
-        raise InputError(f"{path}: has comments alone; {wanted}")
-    return np.array(rows)
 
 
 def find_scans(relations: Relations, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:

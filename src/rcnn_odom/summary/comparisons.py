@@ -5,11 +5,12 @@ from dataclasses import dataclass
 from statistics import fmean
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation import percent
 from rcnn_odom.summary.options import Values, parse_choice, show_value
 from rcnn_odom.summary.paper import NETWORK
 from rcnn_odom.summary.runs_table import Sweep
 from rcnn_odom.summary.statistics import LEVEL, NO_DIFFERENCE, Ratio, holm, paired_ratio, verdict
-from rcnn_odom.summary.tables import DASH, Row, escape, markdown_table, number, percent
+from rcnn_odom.summary.tables import DASH, Row, escape, markdown_table, number
 
 Drifts = dict[Values, dict[int, float]]
 """Ratios by setting and seed."""

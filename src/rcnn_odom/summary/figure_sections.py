@@ -1,6 +1,7 @@
 """Sections with figures: drift against length and speed, and trajectories."""
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation import percent
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.summary.curves import by_length, by_speed, read_curves, trajectory
 from rcnn_odom.summary.document import image
@@ -8,7 +9,7 @@ from rcnn_odom.summary.folders import Run
 from rcnn_odom.summary.options import setting_of
 from rcnn_odom.summary.plots import MOST_BANDS, curves_figure, png, trajectories_figure
 from rcnn_odom.summary.runs_table import Sweep
-from rcnn_odom.summary.tables import code, escape, percent
+from rcnn_odom.summary.tables import code, escape
 
 
 def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:

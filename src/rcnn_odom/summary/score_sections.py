@@ -2,12 +2,13 @@
 
 from collections.abc import Iterable, Sequence
 
+from rcnn_odom.evaluation import percent
 from rcnn_odom.summary import paper
 from rcnn_odom.summary.folders import Run
 from rcnn_odom.summary.runs_table import Sweep
 from rcnn_odom.summary.scores import Scores
 from rcnn_odom.summary.statistics import mean_sd
-from rcnn_odom.summary.tables import DASH, Row, code, escape, markdown_table, number, percent, spread
+from rcnn_odom.summary.tables import DASH, Row, code, escape, markdown_table, number, spread
 
 
 def drift_table(sweep: Sweep) -> tuple[Row, list[Row]]:
@@ -142,7 +143,7 @@ def frame_section(sweep: Sweep) -> str:
         "## Errors of a frame",
         markdown_table(header, rows),
         "Mean absolute and mean signed errors over all motions of the test sequences, then the mean over "
-        "seeds; the largest error of any seed. Drift is mostly the signed ones, added up.",
+        "seeds; the largest error of any seed.",
     ]
     is_papers = sweep.sequences == paper.SEQUENCES
     return "\n\n".join([*lines, paper.FRAME_ERRORS_NOTE] if is_papers else lines)

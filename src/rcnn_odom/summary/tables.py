@@ -3,6 +3,8 @@
 import re
 from collections.abc import Sequence
 
+from rcnn_odom.evaluation import aligned
+
 Row = Sequence[str]
 DASH = "-"
 
@@ -42,23 +44,12 @@ def markdown_table(header: Row, rows: Sequence[Row], words: int = 1, names: Row 
 
 def text_table(header: Row, rows: Sequence[Row]) -> str:
     """The same for a terminal."""
-    cells = [[" ".join(cell.split()) for cell in row] for row in (header, *rows)]
-    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
-    lines = []
-    for first, *rest in cells:
-        padded = [cell.rjust(width) for cell, width in zip(rest, widths[1:], strict=True)]
-        lines.append("  ".join([first.ljust(widths[0]), *padded]).rstrip())
-    return "\n".join(lines)
+    return aligned([[" ".join(cell.split()) for cell in row] for row in (header, *rows)])
 
 
 def number(value: float | None, digits: int = 2) -> str:
     """A number with so many decimals; a dash for None and nan."""
     return DASH if value is None or value != value else f"{value:.{digits}f}"
-
-
-def percent(ratio: float | None) -> str:
-    """A ratio in percent, two decimals."""
-    return number(None if ratio is None else 100 * ratio)
 
 
 def spread(mean: float | None, sd: float | None, digits: int = 2) -> str:
