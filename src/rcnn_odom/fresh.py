@@ -99,5 +99,5 @@ class FreshWorlds:
         """Ends the workers at once and forgets their worlds."""
         if self._workers is not None:
             self._workers.close()
-        self._maker.shutdown(wait=False, cancel_futures=True)
+        self._maker.shutdown(cancel_futures=True)
         self._made.clear()
