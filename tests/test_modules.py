@@ -40,7 +40,8 @@ def settings(variant, **changes):
         "batch_size": 8,
     }
     if variant.startswith("rcnn"):
-        model |= {"hidden_size": 12, "layers": 2, "window": 5, "batch_size": 4, "freeze": False}
+        model |= {"hidden_size": 12, "layers": 2, "projection": None, "freeze": False}
+        model |= {"window": 5, "batch_size": 4}
     return {**model, **changes}
 
 

@@ -260,6 +260,20 @@ def test_rcnn_is_cnn_lstm_and_head(classes):
     assert (estimate.scores is None) == (classes is None)
 
 
+def test_projection_is_an_input_matrix_of_low_rank():
+    torch.manual_seed(5)
+    cnn = CNN(BINS, 40.0, RotationClasses())
+    small = RCNN(cnn, None, hidden=12, projection=6)
+    whole = RCNN(cnn, None, hidden=12)
+    weights = {name: value for name, value in small.state_dict().items() if "projection" not in name}
+    of_features, of_estimates = small.lstm.weight_ih[0].split([6, 2], 1)
+    weights["lstm.weight_ih.0"] = torch.cat([of_features @ small.projection.weight, of_estimates], 1)
+    weights["lstm.bias_ih.0"] = small.lstm.bias_ih[0] + of_features @ small.projection.bias
+    whole.load_state_dict(weights)
+    pairs = 40 * torch.rand(2, 4, 2, BINS)
+    torch.testing.assert_close(small(pairs)[0].motion, whole(pairs)[0].motion, rtol=1e-4, atol=1e-5)
+
+
 @pytest.mark.parametrize("classes", [None, RotationClasses()])
 def test_rcnn_pair_by_pair_equals_the_window(classes):
     torch.manual_seed(3)

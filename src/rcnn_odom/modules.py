@@ -66,7 +66,8 @@ class OdometryModule(L.LightningModule):
             return cnn
         cnn.requires_grad_(not model["freeze"])
         head_classes = self.classes if self.classifies else None
-        return RCNN(cnn, head_classes, model["hidden_size"], model["layers"], angle, dropout)
+        sizes = model["hidden_size"], model["layers"]
+        return RCNN(cnn, head_classes, *sizes, angle, dropout, model["projection"])
 
     def set_motion_statistics(self, mean: FloatArray, deviation: FloatArray) -> None:
         """Mean and deviation (2,), (2,) of the training motions, the heads' units."""

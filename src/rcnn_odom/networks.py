@@ -236,6 +236,8 @@ class RCNN(nn.Module):
         classes: rotation of the final head as classification; None for regression.
         hidden, layers: of the LSTM (paper: 1,024 and 2). angle: see :class:`MotionHead`.
         dropout: part of each LSTM layer's outputs that training hides from what follows.
+        projection: so many linear combinations of the features go into the LSTM in their place, which
+            is an input matrix of that rank; None: the features themselves, as in the paper.
     """
 
     def __init__(
@@ -246,10 +248,13 @@ class RCNN(nn.Module):
         layers: int = 2,
         angle: Literal["expectation", "argmax"] = "expectation",
         dropout: float = 0.0,
+        projection: int | None = None,
     ) -> None:
         super().__init__()
         self.cnn = cnn
-        self.lstm = LSTM(cnn.encoder.features + 2, hidden, layers, dropout)
+        features = cnn.encoder.features
+        self.projection = nn.Linear(features, projection) if projection else nn.Identity()
+        self.lstm = LSTM((projection or features) + 2, hidden, layers, dropout)
         # Drawn as if the two estimates were all the input: as two among thousands of features they would
         # hardly be heard, and the LSTM would have to find out again what the first stage knows.
         with torch.no_grad():
@@ -260,5 +265,6 @@ class RCNN(nn.Module):
         """Estimates for T consecutive pairs (B, T, 2, bins) in metres, and the state after them."""
         features = self.cnn.encode(pairs)
         first = self.cnn.head.standardise(self.cnn.head(features).motion)
+        features = self.projection(features)
         outputs, state = self.lstm(torch.cat([features, first.to(features.dtype)], -1), state)
         return self.head(outputs), state

@@ -78,7 +78,7 @@ RULES: dict[str, Rule] = {
     "dropout": (lambda value: _is_number(value) and 0 <= value < 1, "must be a number from 0 to below 1"),
     "max_turn_deg": (lambda value: _is_number(value) and value >= 0, "must be 0 or a positive number"),
     **dict.fromkeys(
-        ("workers", "frames"),
+        ("workers", "frames", "projection"),
         (lambda value: value is None or _is_count(value), "must be null or a whole number above 0"),
     ),
     "sensor": _group("data.sensor.max_range=40"),
