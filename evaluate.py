@@ -58,13 +58,13 @@ def _estimate_run(chosen: dict) -> tuple[dict, dict]:
     trainer = experiment.build_trainer(settings)
     module = load_module(run / runs.BEST, sensor=Sensor(**settings["data"]["sensor"]))
     datamodule = experiment.build_datamodule(settings).load(("test",))
-    motions = experiment.estimate_test(module, datamodule, trainer)
+    estimates = experiment.estimate_test(module, datamodule, trainer)
     metrics = {
         "run": os.path.relpath(run.resolve()),
         "variant": module.variant,
         "data": settings["data"]["name"],
     }
-    metrics |= report_test(module, motions, datamodule.sequences["test"], settings["data"], folder)
+    metrics |= report_test(module, estimates, datamodule.sequences["test"], settings["data"], folder)
     return settings, metrics
 
 

@@ -196,7 +196,7 @@ def in_one_pass(module, scans):
 @pytest.mark.parametrize("frames", [2, 64, 65, 66, 129, 155])
 def test_estimate_equals_a_single_pass(variant, frames):
     module, scans = build(variant).eval(), random_scans(frames)
-    motions = module.estimate(scans)
+    motions = module.estimate(scans).motions
     assert motions.shape == (frames - 1, 2)
     assert motions.dtype == np.float64
     np.testing.assert_allclose(motions, in_one_pass(module, scans), atol=1e-5)
@@ -205,30 +205,30 @@ def test_estimate_equals_a_single_pass(variant, frames):
 @pytest.mark.parametrize("variant", ["rcnn_reg", "rcnn_cls"])
 def test_lstm_remembers_across_the_chunk_border(variant):
     module, scans = build(variant).eval(), random_scans(155)
-    whole = module.estimate(scans)
+    whole = module.estimate(scans).motions
     # The second chunk begins with frame 64: alone it would know nothing of those before.
-    alone = module.estimate(scans[64:])
+    alone = module.estimate(scans[64:]).motions
     assert np.abs(alone[0] - whole[64]).max() > 1e-4
     changed = scans.clone()
     changed[60] = 0
-    assert np.abs(module.estimate(changed)[64:66] - whole[64:66]).max() > 1e-6
+    assert np.abs(module.estimate(changed).motions[64:66] - whole[64:66]).max() > 1e-6
 
 
 @pytest.mark.parametrize("variant", NAMES)
 def test_estimate_has_no_memory_between_drives(variant):
     module, scans = build(variant).eval(), random_scans(20)
-    first = module.estimate(scans)
+    first = module.estimate(scans).motions
     module.estimate(random_scans(30, seed=1))
-    np.testing.assert_array_equal(module.estimate(scans), first)
+    np.testing.assert_array_equal(module.estimate(scans).motions, first)
 
 
 @pytest.mark.parametrize("variant", NAMES)
 def test_training_mode_and_autocast_do_not_change_estimates(variant):
     module, scans = build(variant), random_scans(70)
-    expected = module.eval().estimate(scans)
-    np.testing.assert_array_equal(module.train().estimate(scans), expected)
+    expected = module.eval().estimate(scans).motions
+    np.testing.assert_array_equal(module.train().estimate(scans).motions, expected)
     with torch.autocast("cpu", torch.bfloat16):
-        np.testing.assert_array_equal(module.estimate(scans), expected)
+        np.testing.assert_array_equal(module.estimate(scans).motions, expected)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -238,7 +238,7 @@ def test_trainers_test_gives_the_estimates_of_each_drive(variant):
     data = small_data(module)
     small_trainer().test(module, datamodule=data, verbose=False)
     expected = in_one_pass(module, torch.from_numpy(data.sequences["test"][0].scans))
-    np.testing.assert_allclose(module.estimates[0], expected, atol=1e-5)
+    np.testing.assert_allclose(module.estimates[0].motions, expected, atol=1e-5)
 
 
 # --- checkpoints ---------------------------------------------------------------------------------
@@ -253,7 +253,7 @@ def test_checkpoint_gives_the_same_estimates(tmp_path, variant):
     assert not loaded.training
     assert loaded.model == module.model
     assert loaded.scoring == SCORING
-    np.testing.assert_array_equal(loaded.estimate(scans), module.eval().estimate(scans))
+    np.testing.assert_array_equal(loaded.estimate(scans).motions, module.eval().estimate(scans).motions)
 
 
 def test_checkpoint_holds_plain_values_only(tmp_path):

@@ -2,8 +2,10 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
+from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.modules import VARIANTS, OdometryModule
 from rcnn_odom.scan import Sensor
@@ -32,7 +34,9 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
         raise InputError(f"{path}: no such checkpoint") from None
     except Exception as error:  # whatever the bytes of a stranger's file lead to
         reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise InputError(f"{path}: not a checkpoint of this project ({reason})") from error
+        raise InputError(
+            f"{path}: not a checkpoint of this project, or of an older version ({reason}); train again"
+        ) from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
     if sensor is not None and settings["sensor"] != sensor.as_dict():
@@ -41,3 +45,33 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
             "set data.sensor as in training, or train on this data"
         )
     return module.eval()
+
+
+def calibrate(path: str | Path, sequences: list[EncodedSequence]) -> OdometryModule:
+    """Fits the uncertainty of a checkpoint's network on validation drives and keeps it in the checkpoint.
+
+    Args:
+        path: a ``.ckpt`` file of a run; it changes at once or not at all.
+        sequences: validation drives with their truth.
+
+    Returns:
+        The module, as :func:`load_module` gives it.
+
+    Raises:
+        InputError: as :func:`load_module`.
+    """
+    module, path = load_module(path), Path(path)
+    estimates = [module.estimate(torch.from_numpy(np.array(sequence.scans))) for sequence in sequences]
+    module.uncertainty.fit(
+        np.concatenate([estimate.features for estimate in estimates]),
+        np.concatenate([estimate.motions for estimate in estimates]),
+        np.concatenate([sequence.motions for sequence in sequences]),
+        np.concatenate([(sequence.scans > 0).mean(1) for sequence in sequences]),
+        np.concatenate([np.diff(sequence.stamps) for sequence in sequences]),
+    )
+    saved = torch.load(path, map_location="cpu", weights_only=True)
+    saved["state_dict"] = module.state_dict()
+    partial = path.with_name(f".{path.name}.partial")
+    torch.save(saved, partial)
+    partial.replace(path)
+    return module

@@ -7,7 +7,7 @@ import numpy as np
 
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.metrics.drift import Drift, drift
-from rcnn_odom.motion import ApplyStep, FloatArray, change_frame, compose, wrap_angle
+from rcnn_odom.motion import ApplyStep, FloatArray, change_frame, compose, motion_errors
 
 STANDING = (0.01, np.deg2rad(0.2))
 """A frame stands still when it moves less than this, metres and radians: the noise of good odometry."""
@@ -64,12 +64,33 @@ def frame_errors(motions: FloatArray, truth: FloatArray) -> Report:
 
     Frames that move and frames that stand still, by the truth, are also told apart.
     """
-    error = motions - truth
-    error[:, 1] = wrap_angle(error[:, 1])
+    error = motion_errors(motions, truth)
     standing = (np.abs(truth) < STANDING).all(1)
     report = _errors(error)
     for name, chosen in (("moving", ~standing), ("standing", standing)):
         report[name] = {"frames": int(chosen.sum()), **(_errors(error[chosen]) if chosen.any() else {})}
+    return report
+
+
+def coverage(motions: FloatArray, truth: FloatArray, deviations: FloatArray) -> Report:
+    """How often the truth lies within one and two of the estimated standard deviations.
+
+    Args:
+        motions, truth, deviations: (N, 2) metres and radians.
+
+    Returns:
+        Shares under ``distance`` and ``heading``, there under ``1`` and ``2``: 0.683 and 0.954 for normal
+        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``.
+    """
+    ratios = np.abs(motion_errors(motions, truth)) / deviations
+    report: Report = {
+        name: {str(times): float((ratios[:, output] <= times).mean()) for times in (1, 2)}
+        for output, name in enumerate(("distance", "heading"))
+    }
+    report["distance_m"], report["heading_deg"] = (
+        float(deviations[:, 0].mean()),
+        float(np.rad2deg(deviations[:, 1]).mean()),
+    )
     return report
 
 
@@ -171,6 +192,22 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 def percent(ratio: float | None) -> str:
     """A ratio in percent; a dash where no segment was long enough to have one."""
     return "-" if ratio is None else f"{100 * ratio:.2f}"
+
+
+def coverage_table(reports: Mapping[str, Report]) -> str:
+    """Text with a row for each sequence: how often the truth lies within the deviations, in percent.
+
+    Args:
+        reports: of :func:`coverage` by the name of the sequence.
+    """
+    columns = [(name, times) for name in ("distance", "heading") for times in ("1", "2")]
+    title = "truth within so many deviations, %"
+    rows = [[title, *(f"{name} {times}" for name, times in columns), "mean, m", "mean, deg"]]
+    rows.append(["of normal errors", *["68.3", "95.4"] * 2, "", ""])
+    for sequence, report in reports.items():
+        shares = [f"{100 * report[name][times]:.1f}" for name, times in columns]
+        rows.append([sequence, *shares, f"{report['distance_m']:.3f}", f"{report['heading_deg']:.3f}"])
+    return aligned(rows)
 
 
 def frame_table(reports: Mapping[str, Report]) -> str:

@@ -14,7 +14,7 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from rcnn_odom.checkpoint import load_module
+from rcnn_odom.checkpoint import calibrate, load_module
 from rcnn_odom.dashboard import Layout, log_run
 from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
@@ -23,7 +23,7 @@ from rcnn_odom.lock import one_at_a_time
 from rcnn_odom.machine import keep_freed_memory, resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
-from rcnn_odom.report import report_test
+from rcnn_odom.report import Estimates, report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
@@ -223,22 +223,28 @@ def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer)
 
 
 def finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, run: Path) -> Report:
-    """Scores the checkpoint with the best validation drift on the test sequences."""
-    module = load_module(run / BEST)
-    motions = estimate_test(module, datamodule, trainer)
+    """Scores the checkpoint with the best validation drift on the test sequences.
+
+    Before that its uncertainty is fitted on the validation sequences.
+    """
+    module = calibrate(run / BEST, datamodule.sequences["val"])
+    estimates = estimate_test(module, datamodule, trainer)
     logger = trainer.logger
     assert isinstance(logger, TensorBoardLogger)
     return {
         "variant": module.variant,
         "data": settings["data"]["name"],
-        **report_test(module, motions, datamodule.sequences["test"], settings["data"], run, logger),
+        **report_test(module, estimates, datamodule.sequences["test"], settings["data"], run, logger),
     }
 
 
-def estimate_test(module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer) -> dict:
-    """Motions (N-1, 2) of every test sequence by name."""
+def estimate_test(module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer) -> Estimates:
+    """What a network makes of the test sequences."""
     trainer.test(module, datamodule=datamodule, verbose=False)
-    return {s.name: module.estimates[number] for number, s in enumerate(datamodule.sequences["test"])}
+    drives = {s.name: module.estimates[number] for number, s in enumerate(datamodule.sequences["test"])}
+    motions = {name: drive.motions for name, drive in drives.items()}
+    deviations = {name: drive.deviations for name, drive in drives.items()}
+    return Estimates(motions, deviations=deviations if module.uncertainty.fitted else {})
 
 
 def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Path, CNNClassification]:

@@ -1,6 +1,6 @@
 """The four variants of the paper as LightningModules."""
 
-from typing import Any, ClassVar
+from typing import Any, ClassVar, NamedTuple
 
 import lightning as L
 import numpy as np
@@ -18,9 +18,24 @@ from rcnn_odom.motion import FloatArray
 from rcnn_odom.networks import CNN, RCNN, RotationClasses
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
+from rcnn_odom.uncertainty import Uncertainty
 
 EVALUATION_CHUNK = 64
 """Pairs that go through the convolutions together when a whole drive is estimated."""
+
+
+class DriveEstimate(NamedTuple):
+    """A network's estimate of one whole drive.
+
+    Attributes:
+        motions: (N-1, 2) metres and radians.
+        deviations: their standard deviations, (N-1, 2); nan while the uncertainty is not fitted.
+        features: (N-1, K) of :class:`rcnn_odom.uncertainty.Uncertainty`.
+    """
+
+    motions: FloatArray
+    deviations: FloatArray
+    features: FloatArray
 
 
 class OdometryModule(L.LightningModule):
@@ -46,7 +61,8 @@ class OdometryModule(L.LightningModule):
         self.sensor = Sensor(**sensor)
         self.classes = RotationClasses(**model["rotation_classes"])
         self.network = self._build()
-        self.estimates: dict[int, FloatArray] = {}
+        self.uncertainty = Uncertainty(self.recurrent)
+        self.estimates: dict[int, DriveEstimate] = {}
         self.outside = MeanMetric()
 
     def _build(self) -> CNN | RCNN:
@@ -114,19 +130,23 @@ class OdometryModule(L.LightningModule):
             torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
 
     @torch.no_grad()
-    def estimate(self, scans: Tensor) -> FloatArray:
-        """Motions (N-1, 2) of one whole drive (N, bins) in metres, the LSTM state carried throughout.
+    def estimate(self, scans: Tensor) -> DriveEstimate:
+        """The motions of one whole drive (N, bins) in metres, the LSTM state carried throughout.
 
         In full precision whatever the training's, so that a checkpoint gives the same numbers everywhere.
         """
-        state, motions = None, []
+        state, motions, features = None, [], []
         with torch.autocast(scans.device.type, enabled=False):
             for start in range(0, len(scans) - 1, EVALUATION_CHUNK):
                 block = scans[start : start + EVALUATION_CHUNK + 1]
                 pairs = torch.stack([block[:-1], block[1:]], dim=1)
                 estimate, state = self.network(pairs[None], state)
                 motions.append(estimate.motion[0].double().cpu().numpy())
-        return np.concatenate(motions)
+                difficulty = self.uncertainty.features(estimate, self.network.head)
+                features.append(difficulty[0].double().cpu().numpy())
+        weights = self.uncertainty.weights.double().cpu().numpy()
+        difficulties = np.concatenate(features)
+        return DriveEstimate(np.concatenate(motions), difficulties @ weights.T, difficulties)
 
     def _validation(self) -> list[EncodedSequence]:
         return self.trainer.datamodule.sequences["val"]  # type: ignore[attr-defined]
@@ -143,7 +163,7 @@ class OdometryModule(L.LightningModule):
             InputError: training has diverged.
         """
         sequence = self._validation()[batch["number"]]
-        motions = self.estimate(batch["scans"])
+        motions = self.estimate(batch["scans"]).motions
         if not np.isfinite(motions).all():
             raise InputError(
                 f"training diverged in epoch {self.current_epoch + 1}: {sequence.name} is estimated as nan "
@@ -166,7 +186,7 @@ class OdometryModule(L.LightningModule):
         self.estimates = {}
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Keeps the estimated motions of one whole sequence; ``rcnn_odom.evaluation`` scores them."""
+        """Keeps the estimate of one whole sequence; ``rcnn_odom.evaluation`` scores it."""
         self.estimates[batch["number"]] = self.estimate(batch["scans"])
 
     def configure_optimizers(self) -> Any:

@@ -58,6 +58,21 @@ def relative_motions(poses: npt.ArrayLike) -> FloatArray:
     return np.stack([distance, np.arctan2(steps[:, 1, 0], steps[:, 0, 0])], axis=1)
 
 
+def motion_errors(motions: FloatArray, truth: FloatArray) -> FloatArray:
+    """Errors (N, 2) of motions (N, 2): metres, and radians the short way round."""
+    errors = motions - truth
+    errors[:, 1] = wrap_angle(errors[:, 1])
+    return errors
+
+
+def advance(pose: FloatArray, motion: FloatArray, apply: ApplyStep = "end") -> FloatArray:
+    """The next pose, x, y and heading (3,), after one motion (2,): a step of :func:`compose`."""
+    x, y, heading = pose
+    distance, turn = motion
+    direction = heading + STEP_FRACTION[apply] * turn
+    return np.array([x + distance * np.cos(direction), y + distance * np.sin(direction), heading + turn])
+
+
 def compose(motions: npt.ArrayLike, apply: ApplyStep = "end") -> FloatArray:
     """Poses (T+1, 4, 4), the first the identity, out of motions (T, 2): paper eq. 2.
 

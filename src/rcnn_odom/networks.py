@@ -18,10 +18,14 @@ State = tuple[tuple[Tensor, Tensor], ...]
 
 
 class Estimate(NamedTuple):
-    """What a head says: motions (..., 2) in metres and radians; class scores (..., C) or None."""
+    """What a head says: motions (..., 2) in metres and radians; class scores (..., C) or None.
+
+    Of a recurrent network also the motions (..., 2) that its first stage estimates.
+    """
 
     motion: Tensor
     scores: Tensor | None
+    first_stage: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -264,7 +268,8 @@ class RCNN(nn.Module):
     def forward(self, pairs: Tensor, state: State | None = None) -> tuple[Estimate, State]:
         """Estimates for T consecutive pairs (B, T, 2, bins) in metres, and the state after them."""
         features = self.cnn.encode(pairs)
-        first = self.cnn.head.standardise(self.cnn.head(features).motion)
+        first_stage = self.cnn.head(features).motion
+        first = self.cnn.head.standardise(first_stage)
         features = self.projection(features)
         outputs, state = self.lstm(torch.cat([features, first.to(features.dtype)], -1), state)
-        return self.head(outputs), state
+        return self.head(outputs)._replace(first_stage=first_stage), state

@@ -14,11 +14,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from rcnn_odom.baselines.constant import ConstantMotion, held_motion
 from rcnn_odom.baselines.icp import PointToLineICP, Steps
 from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.evaluation import Report, percent, score_all, table
-from rcnn_odom.figures import motion_figure, trajectory_figure
+from rcnn_odom.evaluation import Report, coverage, coverage_table, percent, score_all, table
+from rcnn_odom.figures import coverage_figure, motion_figure, trajectory_figure
 from rcnn_odom.latency import measure
 from rcnn_odom.modules import OdometryModule
-from rcnn_odom.motion import FloatArray, change_frame, compose, relative_motions
+from rcnn_odom.motion import FloatArray, change_frame, compose, motion_errors, relative_motions
 from rcnn_odom.networks import State
 from rcnn_odom.settings import Settings
 from rcnn_odom.trajectory import file_name, write_kitti, write_motions, write_tum
@@ -39,10 +39,12 @@ class Estimates:
         motions: (N-1, 2) metres and radians.
         poses: laser poses (N, 4, 4), the first the identity, of a method that also knows the steps' sideways
             part; they stand in place of the composed motions.
+        deviations: standard deviations (N-1, 2) of the motions, of a method that gives them.
     """
 
     motions: Motions
     poses: Mapping[str, FloatArray] = field(default_factory=dict)
+    deviations: Mapping[str, FloatArray] = field(default_factory=dict)
 
     @classmethod
     def of_poses(cls, poses: Mapping[str, FloatArray]) -> "Estimates":
@@ -53,7 +55,7 @@ class Estimates:
 
 def report_test(
     module: OdometryModule,
-    motions: Motions,
+    estimates: Estimates,
     sequences: list[EncodedSequence],
     data: Settings,
     folder: Path,
@@ -63,20 +65,23 @@ def report_test(
 
     Args:
         module: the network that estimated, which also knows the mean of its training motions.
-        motions: its estimates.
+        estimates: what it makes of the sequences.
         sequences: what was estimated.
         data: the options of ``conf/data``.
         folder: gets ``trajectories`` and ``figures``.
         logger: also gets the figures.
 
     Returns:
-        ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name,
+        ``test`` (see :func:`rcnn_odom.evaluation.score_all`), ``baselines`` of the same form by name, in
+        ``coverage`` how often the truth lies within the deviations (see
+        :func:`rcnn_odom.evaluation.coverage`) by sequence where the network's uncertainty has been fitted,
         ``latency`` of the network (see :func:`rcnn_odom.latency.measure`) and ``versions`` of what computed
         them.
     """
     mean = ConstantMotion(module.network.head.mean.double().cpu().numpy())
     latency = measure(*stepping(module, sequences[0].scans))
-    return _report(module.variant, Estimates(motions), mean, latency, sequences, data, folder, logger)
+    report = _report(module.variant, estimates, mean, latency, sequences, data, folder, logger)
+    return report | _report_coverage(module.variant, estimates, sequences, data, folder, logger)
 
 
 def report_icp(
@@ -139,6 +144,29 @@ def _report(
     times = latency["median_ms"], latency["p99_ms"]
     log.info("%s: %.2f ms a frame, 99th percentile %.2f, on one thread", name, *times)
     return {"test": test, "baselines": reports, "latency": latency, "versions": versions}
+
+
+def _report_coverage(
+    name: str,
+    estimates: Estimates,
+    sequences: list[EncodedSequence],
+    data: Settings,
+    folder: Path,
+    logger: TensorBoardLogger | None,
+) -> Report:
+    """``coverage`` by sequence with its table and figure; nothing where there are no deviations."""
+    if not estimates.deviations:
+        return {}
+    cases = {s.name: (estimates.motions[s.name], s.motions, estimates.deviations[s.name]) for s in sequences}
+    shares = {sequence: coverage(*case) for sequence, case in cases.items()}
+    log.info("%s\n", coverage_table(shares))
+    ratios = [np.abs(motion_errors(m, t)) / deviations for m, t, deviations in cases.values()]
+    title = f"{name} on {data['name']} {', '.join(cases)}: errors within their estimated deviations"
+    figure = coverage_figure(title, np.concatenate(ratios))
+    figure.savefig(folder / "figures" / "coverage.png", dpi=120)
+    if logger is not None:
+        logger.experiment.add_figure("test/coverage", figure)
+    return {"coverage": shares}
 
 
 def stepping(module: OdometryModule, scans: npt.NDArray[np.float32]) -> tuple[Callable[[int], object], int]:
