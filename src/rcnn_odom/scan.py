@@ -77,3 +77,11 @@ def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.
     if closes_circle:
         vector[-1] = vector[0]
     return vector
+
+
+def decode(depth: npt.NDArray[np.float32], sensor: Sensor) -> npt.NDArray[np.float64]:
+    """Points (P, 2) in metres, x ahead and y to the left, in the middles of bins (bins,) with a return."""
+    distinct = depth[:-1] if sensor.field_of_view_deg == 360 else depth
+    bins = np.flatnonzero(distinct)
+    angles = np.deg2rad(bins * sensor.resolution_deg - sensor.field_of_view_deg / 2)
+    return depth[bins, None] * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -6,7 +6,7 @@ import sys
 from collections.abc import Sequence
 
 from rcnn_odom import __version__
-from rcnn_odom.cli import drift, frames, relations, report, simulate
+from rcnn_odom.cli import drift, export, frames, relations, report, run, simulate
 from rcnn_odom.errors import InputError
 
 # Heavy imports stay inside the commands, so that --help answers at once.
@@ -43,6 +43,6 @@ def _build_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="rcnn-odom", description="Jobs on files of laser odometry.")
     parser.add_argument("--version", action="version", version=f"rcnn-odom {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (drift, frames, relations, simulate, report):
+    for command in (drift, frames, relations, simulate, report, export, run):
         command.add(commands)
     return parser
