@@ -6,6 +6,7 @@ Poses here are (N, 4, 4) from the camera's frame (x right, y down, z forward) to
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
+from typing import TextIO
 
 import numpy as np
 import numpy.typing as npt
@@ -121,11 +122,12 @@ def read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
     return np.array(rows)
 
 
-def write_kitti(path: str | Path, poses: npt.ArrayLike) -> None:
+def write_kitti(path: str | Path | TextIO, poses: npt.ArrayLike) -> None:
     """Write poses (N, 4, 4) in KITTI's format, in full precision: `read_kitti` returns the same numbers.
 
     Rounding would matter more than it seems: at a constant speed a distance may equal a segment's
-    length, and the last digit then decides where the segment ends.
+    length, and the last digit then decides where the segment ends. Into a file that is open the lines are
+    added.
 
     Raises:
         ValueError: ``poses`` has another shape.
@@ -134,11 +136,11 @@ def write_kitti(path: str | Path, poses: npt.ArrayLike) -> None:
     np.savetxt(path, poses[:, :3].reshape(-1, 12), fmt="%.16e")
 
 
-def write_tum(path: str | Path, stamps: npt.ArrayLike, poses: npt.ArrayLike) -> None:
+def write_tum(path: str | Path | TextIO, stamps: npt.ArrayLike, poses: npt.ArrayLike) -> None:
     """Write lines of ``stamp x y z qx qy qz qw``, the format of the TUM RGB-D benchmark.
 
     Args:
-        path: text file to write.
+        path: text file to write, or one that is open for writing and gets more lines.
         stamps: times (N,) in seconds.
         poses: (N, 4, 4), translations in metres. The frame is kept: camera poses stay camera poses.
 

@@ -11,6 +11,7 @@ The lines, one blank between fields::
 import bz2
 import gzip
 import hashlib
+import logging
 import zlib
 from collections import Counter
 from collections.abc import Iterator
@@ -22,8 +23,11 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.datasets.stream import Scan, ScanStream
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, planar_to_poses, wrap_angle
+
+log = logging.getLogger(__name__)
 
 READER_VERSION = 1
 """Raised whenever the same file would give other scans."""
@@ -82,6 +86,53 @@ def load(
         wheel_odometry=_wheel_odometry(lines),
         notes=tuple(notes),
     )
+
+
+def stream(path: Path, field_of_view_deg: float = 180.0) -> ScanStream:
+    """The scans of a log, one after the other in the order of the file, whose stamps are not trusted.
+
+    A broken line is told, skipped and counted; so are lines of other lasers and of another kind than the
+    first.
+
+    Args:
+        path: of the log, plain, .gz or .bz2.
+        field_of_view_deg: degrees that the beams of FLASER lines cover.
+
+    Raises:
+        InputError: the file cannot be read to its end, or has no scan; raised where ``scans`` is read.
+    """
+    skipped: Counter[str] = Counter()
+    scans = _stream_scans(path, field_of_view_deg, skipped)
+    return ScanStream(name=path.name, scans=scans, has_clock=False, skipped=skipped)
+
+
+def _stream_scans(path: Path, field_of_view_deg: float, skipped: Counter[str]) -> Iterator[Scan]:
+    first_kind = None
+    for number, text in _lines_of(path):
+        kind = text.split(None, 1)[0] if text.strip() else ""
+        if kind not in READ or first_kind not in (None, kind):
+            if "LASER" in kind and not kind.startswith("#"):
+                skipped[f"{kind} lines"] += 1
+            continue
+        try:
+            line = _parse(text, field_of_view_deg)
+        except ValueError as error:
+            skipped["broken lines"] += 1
+            log.warning("%s:%d: broken %s line (%s), skipped", path, number, kind, error)
+            continue
+        first_kind = kind
+        angles, ranges = Beams.of([line])(0)
+        yield Scan(ranges, angles, line.stamp)
+    if first_kind is None:
+        others = f", only {', '.join(sorted(skipped))}" if skipped else ""
+        raise InputError(
+            f"{path}: no FLASER or ROBOTLASER1 line in it{others}; convert the log to one of them"
+        )
+
+
+def _parse(text: str, field_of_view_deg: float) -> "LaserLine":
+    fields = text.split()
+    return _parse_flaser(fields, field_of_view_deg) if fields[0] == "FLASER" else _parse_robotlaser(fields)
 
 
 class LaserLine(NamedTuple):
@@ -176,8 +227,7 @@ def _read_log(path: Path, field_of_view_deg: float) -> tuple[list[LaserLine], Co
                 others[kind] += 1
             continue
         try:
-            fields = text.split()
-            line = _parse_flaser(fields, field_of_view_deg) if kind == "FLASER" else _parse_robotlaser(fields)
+            line = _parse(text, field_of_view_deg)
         except ValueError as error:
             raise InputError(
                 f"{path}:{number}: broken {kind} line ({error}); correct or remove it"

@@ -5,6 +5,7 @@ Layout: ``root/sequences/NAME/{velodyne/*.bin,calib.txt,times.txt}`` and ``root/
 
 import hashlib
 import os
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,6 +13,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.datasets.sequence import Sequence
+from rcnn_odom.datasets.stream import Scan, ScanStream
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame
 from rcnn_odom.trajectory import read_kitti
@@ -20,6 +22,8 @@ READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
 
 POINT_BYTES = 16
+VELODYNE = (360.0, 0.18)
+"""Degrees that a ring covers, and degrees between its beams."""
 SAMPLED_FRAMES = 20
 RING_DROP = np.deg2rad(30.0)
 """The azimuth drops by more than this between rings; within one, close objects make it drop by up to 7."""
@@ -61,25 +65,64 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
     stamps = _read_stamps(folder / "times.txt")
     camera_poses = _read_poses(root / "poses" / f"{name}.txt")
     _need_same_number(folder, len(scans), len(stamps), len(camera_poses))
+    reader, chosen = _choose_ring(scans, ring)
+    key = f"kitti {READER_VERSION} {reader.ring} {fingerprint_of_files}"
+    return Sequence(
+        name=name,
+        poses=change_frame(camera_poses, np.linalg.inv(camera_from_laser)),
+        stamps=stamps,
+        read_scan=reader,
+        fingerprint=hashlib.sha256(key.encode()).hexdigest(),
+        camera_from_laser=camera_from_laser,
+        notes=(f"{len(scans)} scans", chosen),
+    )
+
+
+def stream(folder: Path, ring: int | None = None) -> ScanStream:
+    """The scans of a sequence's folder, one after the other; its truth is not needed.
+
+    Args:
+        folder: ``sequences/NAME``.
+        ring: as for :func:`load`.
+
+    Raises:
+        InputError: a file is missing, cut off or not as the format says.
+    """
+    scans, _ = _list_scans(folder / "velodyne")
+    camera_from_laser = read_calibration(folder / "calib.txt")
+    stamps = _read_stamps(folder / "times.txt")
+    if len(stamps) != len(scans):
+        raise InputError(
+            f"{folder}: {len(scans)} scans in velodyne/, but {len(stamps)} lines in times.txt; copy it again"
+        )
+    reader, chosen = _choose_ring(scans, ring)
+
+    def read() -> Iterator[Scan]:
+        for frame, stamp in enumerate(stamps):
+            yield Scan(reader.points(frame), None, float(stamp))
+
+    return ScanStream(
+        name=folder.resolve().name,
+        scans=read(),
+        total=len(scans),
+        beams=VELODYNE,
+        camera_from_laser=camera_from_laser,
+        notes=(f"{len(scans)} scans", chosen),
+    )
+
+
+def _choose_ring(scans: list[Path], ring: int | None) -> tuple["RingReader", str]:
+    """The reader of one ring for all scans, and words about it."""
     elevations = _ring_elevations(scans)
     if ring is None:
         ring = int(np.argmin(np.abs(elevations - LEVEL)))
     elif not 0 <= ring < len(elevations):
         raise InputError(
-            f"data.ring must be 0 to {len(elevations) - 1}, not {ring}; or null, the most level one"
+            f"data.ring (--ring) must be 0 to {len(elevations) - 1}, not {ring}; left out: the most level one"
         )
     elevation = float(elevations[ring])
     chosen = f"ring {ring} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"
-    key = f"kitti {READER_VERSION} {ring} {fingerprint_of_files}"
-    return Sequence(
-        name=name,
-        poses=change_frame(camera_poses, np.linalg.inv(camera_from_laser)),
-        stamps=stamps,
-        read_scan=RingReader(tuple(map(str, scans)), ring, elevation),
-        fingerprint=hashlib.sha256(key.encode()).hexdigest(),
-        camera_from_laser=camera_from_laser,
-        notes=(f"{len(scans)} scans", chosen),
-    )
+    return RingReader(tuple(map(str, scans)), ring, elevation), chosen
 
 
 @dataclass(frozen=True)
@@ -95,7 +138,12 @@ class RingReader:
     elevation: float
 
     def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Read one frame.
+        """Read one frame; raises as :meth:`points`."""
+        x, y = self.points(frame).T
+        return np.arctan2(y, x), np.hypot(x, y)
+
+    def points(self, frame: int) -> FloatArray:
+        """The ring's returns in one frame: x and y in metres, (P, 2).
 
         Raises:
             InputError: the frame cannot be read or has no such ring.
@@ -108,8 +156,7 @@ class RingReader:
                 f"{path}: frame {frame} has {len(starts)} rings, so no ring {self.ring} (they count "
                 "from 0); choose a smaller data.ring, or download the file again"
             )
-        x, y, _ = self._find_ring(_split_rings(points, starts)).T.astype(np.float64)
-        return np.arctan2(y, x), np.hypot(x, y)
+        return self._find_ring(_split_rings(points, starts))[:, :2].astype(np.float64)
 
     def _find_ring(self, rings: list[Points]) -> Points:
         def distance(ring: Points) -> float:
