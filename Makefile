@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test lint install
+.PHONY: train test lint bench install
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
@@ -15,6 +15,9 @@ train: install
 
 test: install
 	$(BIN)/pytest
+
+bench: install
+	$(BIN)/python -m rcnn_odom.bench
 
 lint: install
 	$(BIN)/ruff check

@@ -1,0 +1,68 @@
+"""A ROS 2 node that turns sensor_msgs/LaserScan into nav_msgs/Odometry with a trained network.
+
+    pip install rcnn-odom          # into the Python of your ROS 2
+    python3 ros2_node.py --ros-args -p model:=rcnn_small -r scan:=/my_laser
+
+Parameters: model (rcnn_small, an exported .onnx or a .ckpt), odom_frame (odom). Publishes /odom: the pose of
+the laser where its first scan is the origin, and as twist the last step over its time with the network's
+variances. No TF is sent, since a robot's laser has a parent already. What an estimate suffers from (gaps, few
+returns) is logged as a warning; a late scan is not published. The file can be imported without ROS.
+"""
+
+import math
+from contextlib import suppress
+
+from rcnn_odom.datasets.rosbag import convert
+from rcnn_odom.datasets.stream import Scan, ScanStream, need_fitting_scan
+from rcnn_odom.odometer import LATE, Odometer, Pose
+
+
+def fill(message, pose: Pose, seconds: float) -> None:
+    """Writes a pose into an Odometry message; its last step took so many seconds."""
+    message.pose.pose.position.x, message.pose.pose.position.y = pose.x, pose.y
+    message.pose.pose.orientation.z = math.sin(pose.heading / 2)
+    message.pose.pose.orientation.w = math.cos(pose.heading / 2)
+    if seconds > 0:
+        message.twist.twist.linear.x = pose.distance / seconds
+        message.twist.twist.angular.z = pose.turn / seconds
+        if not math.isnan(pose.distance_deviation):
+            message.twist.covariance[0] = (pose.distance_deviation / seconds) ** 2
+            message.twist.covariance[35] = (pose.turn_deviation / seconds) ** 2
+
+
+def main() -> None:
+    """Runs the node until Ctrl-C."""
+    import rclpy
+    from nav_msgs.msg import Odometry
+    from rclpy.qos import qos_profile_sensor_data
+    from sensor_msgs.msg import LaserScan
+
+    rclpy.init()
+    node = rclpy.create_node("rcnn_odom")
+    model = node.declare_parameter("model", "rcnn_small").value
+    frame = node.declare_parameter("odom_frame", "odom").value
+    odometer = (Odometer.from_checkpoint if model.endswith(".ckpt") else Odometer.from_onnx)(model)
+    publisher, last = node.create_publisher(Odometry, "odom", 10), []
+
+    def on_scan(message) -> None:
+        scan: Scan = convert(message)
+        if not last:  # raises InputError where the laser is not the model's
+            need_fitting_scan(ScanStream("scan", iter(())), scan, odometer.description.sensor)
+        pose = odometer.step(scan.ranges, scan.stamp, scan.angles)
+        if pose.degraded:
+            node.get_logger().warning(pose.degraded)
+        if pose.degraded.startswith(LATE):
+            return
+        odometry = Odometry(header=message.header, child_frame_id=message.header.frame_id)
+        odometry.header.frame_id = frame
+        fill(odometry, pose, scan.stamp - last[0] if last else 0.0)
+        last[:] = [scan.stamp]
+        publisher.publish(odometry)
+
+    node.create_subscription(LaserScan, "scan", on_scan, qos_profile_sensor_data)
+    with suppress(KeyboardInterrupt):
+        rclpy.spin(node)
+
+
+if __name__ == "__main__":
+    main()
