@@ -26,7 +26,7 @@ from rcnn_odom.evaluation import (
     table,
 )
 from rcnn_odom.motion import FORWARD_CAMERA, compose, planar_to_poses
-from rcnn_odom.report import report_icp, report_test
+from rcnn_odom.report import Estimates, report_icp, report_test
 from rcnn_odom.scan import Sensor
 from rcnn_odom.trajectory import read_kitti, read_motions, write_motions
 
@@ -261,7 +261,7 @@ def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     sequence = drive([(0, 0, 0), (1, 0, 0), (1, 1.5, 0.25)], "05")
     module = StubModule()
     data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
-    report_test(module, {"05": np.array([[0.875, 0.0], [1.25, -0.5]])}, [sequence], data, tmp_path)
+    report_test(module, Estimates({"05": np.array([[0.875, 0.0], [1.25, -0.5]])}), [sequence], data, tmp_path)
     header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
     assert header == (
         "frame,distance_m,heading_rad,true_distance_m,true_heading_rad,"

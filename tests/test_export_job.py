@@ -79,3 +79,14 @@ def test_training_tells_the_coverage(run):
     assert set(coverage) == {"distance", "heading", "distance_m", "heading_deg"}
     assert 0 <= coverage["distance"]["1"] <= coverage["distance"]["2"] <= 1
     assert (run / "figures" / "coverage.png").stat().st_size > 5000
+
+
+def test_other_drives_to_fit_the_uncertainty_on(run, capsys):
+    assert main(["export", str(run), "--fit-on", "10", "00[0.5:]"]) == 1
+    assert "--fit-on: 00 was trained or is tested on; name other drives" in capsys.readouterr().err
+    before = torch.load(run / BEST, weights_only=True)["state_dict"]["uncertainty.weights"]
+    assert main(["export", str(run), "--fit-on", "10[:0.5]"]) == 0
+    printed = capsys.readouterr().out
+    assert "truth within so many deviations, %" in printed
+    after = torch.load(run / BEST, weights_only=True)["state_dict"]["uncertainty.weights"]
+    assert not torch.equal(before, after)

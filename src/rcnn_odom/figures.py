@@ -117,6 +117,7 @@ def map_figure(title: str, poses: FloatArray, points: list[npt.NDArray[np.float3
             origin="lower",
             extent=(*limits[0], *limits[1]),
         )
+    axes.plot([], [], "s", color="0.3", markersize=4, label="returns, darker where more")
     axes.plot(-poses[:, 1], poses[:, 0], color=ESTIMATE, linewidth=1.2, label="estimated path")
     axes.plot(-poses[0, 1], poses[0, 0], "k^", label="start")
     axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
