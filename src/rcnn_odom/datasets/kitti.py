@@ -118,8 +118,8 @@ def _choose_ring(scans: list[Path], ring: int | None) -> tuple["RingReader", str
         ring = int(np.argmin(np.abs(elevations - LEVEL)))
     elif not 0 <= ring < len(elevations):
         raise InputError(
-            f"data.ring must be 0 to {len(elevations) - 1}, not {ring} (of rcnn-odom run: --ring); left out, it "
-            "is the most level one"
+            f"data.ring must be 0 to {len(elevations) - 1}, not {ring} (of rcnn-odom run: --ring); left "
+            "out, it is the most level one"
         )
     elevation = float(elevations[ring])
     chosen = f"ring {ring} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"
