@@ -249,5 +249,5 @@ def test_the_custom_scalars_have_groups_and_lines(open_tab, sweep):
 
 def test_the_scalars_and_the_figures_are_shown(open_tab):
     open_tab("scalars", LINES, lambda lines: {"train", "val", "drift/test", "drift/test/05"} <= set(lines))
-    # A trajectory and a motion figure of each run, loaded to their pixels.
-    open_tab("images", IMAGE_WIDTHS, lambda widths: len(widths) == 2 * len(KERNELS) and min(widths) > 300)
+    # Trajectory, motions and coverage of each run, loaded to their pixels.
+    open_tab("images", IMAGE_WIDTHS, lambda widths: len(widths) == 3 * len(KERNELS) and min(widths) > 300)
