@@ -1,6 +1,6 @@
 """A ROS 2 node that turns sensor_msgs/LaserScan into nav_msgs/Odometry with a trained network.
 
-    pip install rcnn-odom          # into the Python of your ROS 2
+    pip install PATH_OF_THIS_REPOSITORY    # into the Python of your ROS 2
     python3 ros2_node.py --ros-args -p model:=rcnn_small -r scan:=/my_laser
 
 Parameters: model (rcnn_small, an exported .onnx or a .ckpt), odom_frame (odom). Publishes /odom: the pose of
@@ -42,12 +42,13 @@ def main() -> None:
     model = node.declare_parameter("model", "rcnn_small").value
     frame = node.declare_parameter("odom_frame", "odom").value
     odometer = (Odometer.from_checkpoint if model.endswith(".ckpt") else Odometer.from_onnx)(model)
-    publisher, last = node.create_publisher(Odometry, "odom", 10), []
+    publisher, last, fits = node.create_publisher(Odometry, "odom", 10), [], []
 
     def on_scan(message) -> None:
-        scan: Scan = convert(message)
-        if not last:  # raises InputError where the laser is not the model's
+        scan: Scan = convert(message, node.get_clock().now().nanoseconds)
+        if not fits and (scan.ranges > 0).any():  # raises InputError where the laser is not the model's
             need_fitting_scan(ScanStream("scan", iter(())), scan, odometer.description.sensor)
+            fits.append(True)
         pose = odometer.step(scan.ranges, scan.stamp, scan.angles)
         if pose.degraded:
             node.get_logger().warning(pose.degraded)

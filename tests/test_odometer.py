@@ -238,7 +238,26 @@ def test_another_rate_than_trainings_is_told(recorder):
     ] * 10
     fast = Odometer(recorder)
     poses = [fast.step(scan, 0.05 * number, ANGLES) for number, scan in enumerate(random_scans(20))]
-    assert not any(pose.degraded for pose in poses)
+    assert [pose.degraded for pose in poses[10:]] == [
+        "fast scans: one every 0.05 s, in training every 0.1 s"
+    ] * 10
+
+
+@pytest.mark.parametrize("unstamped", [[7], range(3, 23), range(1, 40, 2)])
+def test_scans_without_stamps_among_others_count_once(recorder, unstamped):
+    odometer = Odometer(recorder)
+    for number, scan in enumerate(random_scans(40)):
+        pose = odometer.step(scan, None if number in unstamped else PERIOD * number, ANGLES)
+        assert pose.degraded == ""
+    assert len(recorder.pairs) == 39
+
+
+def test_wild_stamps_and_angles_do_not_raise(recorder):
+    odometer, scans = Odometer(recorder), random_scans(8)
+    drive(odometer, scans[:5])
+    assert "gap" in odometer.step(scans[5], 1e308, ANGLES).degraded
+    odometer.reset()
+    assert "no returns" in odometer.step(scans[6], 0.0, np.full(181, 1e307)).degraded
 
 
 def test_one_scan_without_a_stamp_does_not_forget_the_others(recorder):

@@ -72,6 +72,7 @@ def test_the_node_on_stand_ins(example, tmp_path, monkeypatch):
         declare_parameter=lambda name, default: SimpleNamespace(value=values.get(name, default)),
         create_publisher=lambda kind, topic, depth: SimpleNamespace(publish=published.append),
         create_subscription=lambda kind, topic, handler, profile: handlers.append(handler),
+        get_clock=lambda: SimpleNamespace(now=lambda: SimpleNamespace(nanoseconds=10**9)),
         get_logger=lambda: SimpleNamespace(warning=warnings.append),
     )
     modules = {
@@ -86,6 +87,8 @@ def test_the_node_on_stand_ins(example, tmp_path, monkeypatch):
         monkeypatch.setitem(sys.modules, name, stand_in)
     example.main()
     scans, odometer = random_scans(4), Odometer.from_onnx(tmp_path / "tiny.onnx")
+    handlers[0](scan_message([], 98.0))  # an empty scan says nothing of the laser
+    assert (published.pop().pose.pose.position.x, warnings.pop()) == (0.0, "no returns: none since the start")
     with pytest.raises(InputError, match="but the model is for 180"):
         handlers[0](scan_message(scans[0][:90], 99.0))
     for number, scan in enumerate([*scans, np.zeros(181), np.zeros(181)]):

@@ -19,6 +19,8 @@ REMEMBERED = 15
 """Intervals that tell the usual period."""
 FOLLOWING = 0.2
 """Part of a stamp's jitter that the expected time of the next scan follows."""
+FOREVER = 1e9
+"""Periods that no longer differ; a wild stamp is farther away than an integer can tell."""
 SLOW = 1.5
 """Times the period of training from which on steps are longer than a network knows."""
 SAME_SPACING = 0.2
@@ -102,7 +104,7 @@ class Odometer:
     What may go wrong in a stream never raises and leaves the LSTM's state as it was. The pose's
     ``degraded`` then says what happened, the kind of it before a colon:
 
-    - *no returns*: the last motion goes on.
+    - *no returns*: the last motion goes on, as over a gap.
     - *gap*, where scans were dropped or had no returns, so that more than one usual period has passed
       (of recent scans, but at least that of training): the last motion goes on over it, for
       ``LONGEST_HOLD`` periods at most. Networks do not know such long steps; comparing the scans at both
@@ -110,6 +112,8 @@ class Odometer:
     - *late scan*, a stamp not after the one before: passed over, and the pose is the last one again.
       After ``LATE_IN_A_ROW`` of them the clock is taken as set, and it goes on as after a gap.
     - *slow scans*: more than 1.5 times the period of training between them; the estimate stands.
+    - *fast scans*: less than the period of training over 1.5; the estimate stands, but gaps are counted in
+      periods of training, so that short ones are not noticed and over long ones too little is held.
     - *beam count*, other than before: the scan is encoded into the same bins as any other.
     - *few returns*: less than half as many bins have one as in any validation scan; the estimate stands.
     - *no estimate*: the network gave nan or inf; the last motion goes on, and the LSTM starts anew.
@@ -168,7 +172,7 @@ class Odometer:
 
     def _forget_clock(self) -> None:
         self._stamp: float | None = None
-        self._expected, self._late = 0.0, 0
+        self._expected, self._late, self._unstamped = 0.0, 0, 0
         self._intervals: deque[float] = deque(maxlen=REMEMBERED)
 
     def step(
@@ -273,8 +277,10 @@ class Odometer:
         Measured from where the last scan was expected, which follows a jittering or bursty clock slowly.
         """
         if stamp is None:
+            self._unstamped += 1
             return 1
         before, self._stamp, self._late = self._stamp, stamp, 0
+        scans, self._unstamped = 1 + self._unstamped, 0
         if before is None:
             self._expected = stamp
             return 1
@@ -283,14 +289,16 @@ class Odometer:
         middles = [np.median(self._intervals), np.mean(self._intervals)] if len(self._intervals) >= 3 else []
         recent = float(min(middles, default=math.nan))
         usual = float(np.fmax(recent, trained))
-        self._intervals.append(stamp - before)
+        self._intervals.append((stamp - before) / scans)
         if math.isnan(usual):
             self._expected = stamp
             return 1
         if recent > SLOW * trained:
             notes.append(f"slow scans: one every {recent:.3g} s, in training every {trained:.3g} s")
-        late = stamp - self._expected - usual
-        lost = max(0, round(late / usual))
+        elif max(middles, default=math.inf) * SLOW < trained:
+            notes.append(f"fast scans: one every {recent:.3g} s, in training every {trained:.3g} s")
+        late = stamp - self._expected - scans * usual
+        lost = max(0, round(min(late / usual, FOREVER)))
         self._expected = stamp - (1 - FOLLOWING) * (late - lost * usual)
         return 1 + lost
 

@@ -60,9 +60,11 @@ def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.
     """
     angles = np.asarray(angles, dtype=np.float64)
     ranges = np.asarray(ranges, dtype=np.float64)
-    returned = (ranges > 0) & (ranges < sensor.max_range) & np.isfinite(angles)
+    with np.errstate(over="ignore"):  # of angles that no turn of the circle explains
+        degrees = np.rad2deg(angles)
+    returned = (ranges > 0) & (ranges < sensor.max_range) & np.isfinite(degrees)
     # Turned so that bin 0 begins at 0: rounding never splits the bin behind the laser.
-    turned = np.rad2deg(angles[returned]) + (sensor.field_of_view_deg + sensor.resolution_deg) / 2
+    turned = degrees[returned] + (sensor.field_of_view_deg + sensor.resolution_deg) / 2
     index = np.floor((turned % 360.0) / sensor.resolution_deg + 1e-9).astype(np.int64)
     closes_circle = sensor.field_of_view_deg == 360
     distinct = sensor.bins - 1 if closes_circle else sensor.bins
