@@ -7,6 +7,7 @@ from functools import partial
 import hydra
 from omegaconf import DictConfig
 
+import rcnn_odom.run_folder  # noqa: F401  for conf/config.yaml
 from rcnn_odom.job import in_sweep, run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
@@ -30,6 +31,7 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     from rcnn_odom import experiment, runs
     from rcnn_odom.errors import InputError
     from rcnn_odom.lock import one_at_a_time
+    from rcnn_odom.saving import Stopped
     from rcnn_odom.settings import plain
 
     if cfg.model.variant == "icp":
@@ -39,18 +41,18 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     if reuse and (done := runs.finished(run, settings)):
         log.info("run %s is finished already", run)
         return done
-    trainer = experiment.build_trainer(settings, run)
-    datamodule = experiment.build_datamodule(settings)
-    runs.start_run(run, settings)
-    datamodule.load()
-    runs.point_latest(outputs, run)
     try:
-        fingerprint = runs.fingerprint(settings, datamodule)
-        with one_at_a_time(outputs / "cache", fingerprint, "training the same"):
-            metrics = experiment.train_module(settings, datamodule, trainer, reuse=reuse)
-    except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after the former
-        how = "" if reuse else f" with run_dir={run}"
-        log.error("stopped; the same command%s goes on", how)
+        trainer = experiment.build_trainer(settings, run)
+        datamodule = experiment.build_datamodule(settings)
+        runs.start_run(run, settings)
+        with runs.claimed(run):
+            datamodule.load()
+            runs.point_latest(outputs, run)
+            fingerprint = runs.fingerprint(settings, datamodule)
+            with one_at_a_time(outputs / "cache", fingerprint, "training the same"):
+                metrics = experiment.train_module(settings, datamodule, trainer, reuse=reuse)
+    except (KeyboardInterrupt, SystemExit, Stopped):  # Lightning ends by the second after the first
+        log.error("stopped; the same command goes on from what is in %s", run)
         raise KeyboardInterrupt from None
     log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
     return metrics

@@ -97,6 +97,32 @@ def test_second_call_reads_the_file_and_no_scan(tmp_path, calls):
     assert not after.scans.flags.writeable
 
 
+@pytest.mark.parametrize("place", [0, 9, 200, -40, -1])
+def test_damaged_file_is_noticed_and_encoded_again(tmp_path, calls, caplog, place):
+    cache = tmp_path / "cache"
+    encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [path] = cache.glob("*.npy")
+    content = bytearray(path.read_bytes())
+    content[place] ^= 1
+    path.write_bytes(content)
+    [again] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    np.testing.assert_array_equal(again.scans, direct(0))
+    assert f"{path}: damaged" in caplog.text
+    content[place] ^= 1
+    assert path.read_bytes() == content
+
+
+@pytest.mark.parametrize("bytes_left", [0, 10, 500, -1])
+def test_cut_off_file_is_noticed_and_encoded_again(tmp_path, calls, caplog, bytes_left):
+    cache = tmp_path / "cache"
+    encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [path] = cache.glob("*.npy")
+    path.write_bytes(path.read_bytes()[:bytes_left])
+    [again] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    np.testing.assert_array_equal(again.scans, direct(0))
+    assert f"{path}: damaged" in caplog.text
+
+
 def test_only_what_is_missing_is_encoded(tmp_path, calls):
     cache = tmp_path / "cache"
     encode_sequences([make_sequence(calls, 0, frames=4)], SENSOR, cache, workers=1)

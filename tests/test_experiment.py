@@ -172,10 +172,10 @@ def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, mo
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.EpochLines, "on_train_epoch_start", stop, raising=False)
+        patch.setattr(experiment.TrainingLog, "on_train_epoch_start", stop, raising=False)
         with pytest.raises(KeyboardInterrupt):
             train(configure("model=cnn_reg", *kitti))
-    assert f"run_dir={tmp_path}/outputs/run goes on" in caplog.text
+    assert f"the same command goes on from what is in {tmp_path}/outputs/run" in caplog.text
     assert (tmp_path / "outputs" / "run" / LAST).exists()
     assert train(configure("model=cnn_reg", *kitti))["test"] == whole["test"]
 
@@ -220,7 +220,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
         ("data.lengths=100", "must list lengths"),
         ("data.ring=abc", "must be null or a whole number"),
         ("data.ring=9", "data.ring must be 0 to 3"),
-        ("trainer.devices=2", "one device"),
+        ("trainer.devices=2", "trainer=ddp trainer.devices"),
         ("data.train=00", "must list sequences"),
         ("data.val=['10','10']", "each once"),
         ("data.sensor.max_range=far", "must be a number above 0"),
@@ -331,7 +331,7 @@ def test_stopped_run_on_fresh_worlds_goes_on_with_the_same_worlds(configure, tmp
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.EpochLines, "on_train_epoch_start", stop, raising=False)
+        patch.setattr(experiment.TrainingLog, "on_train_epoch_start", stop, raising=False)
         with pytest.raises(KeyboardInterrupt):
             train(configure("model=cnn_reg", *FRESH))
     assert multiprocessing.active_children() == []

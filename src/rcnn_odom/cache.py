@@ -12,6 +12,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 from types import TracebackType
+from typing import IO
 
 import numpy as np
 import numpy.typing as npt
@@ -28,6 +29,8 @@ log = logging.getLogger(__name__)
 
 ENCODING_VERSION = 1
 """Raised whenever ``rcnn_odom.scan.encode`` gives other numbers for the same input."""
+CHECKSUM = hashlib.sha256
+"""Of all that goes before it in a file of the cache, which it ends."""
 DAY = 86400.0
 
 OpenDrive = Callable[[str], Sequence]
@@ -126,36 +129,63 @@ def encode_sequences(
     Raises:
         InputError: a frame cannot be read, or the folder cannot be made or is full.
     """
-    if not all(is_cached(sequence, sensor, folder) for sequence in sequences):
+    scans = [open_cached(sequence, sensor, folder) for sequence in sequences]
+    if any(found is None for found in scans):
         _make_folder(folder)
         with one_at_a_time(folder, "encoding", "encoding scans"):
-            missing = [sequence for sequence in sequences if not is_cached(sequence, sensor, folder)]
+            # Another process may have been faster.
+            missing = [s for s, found in zip(sequences, scans, strict=True) if found is None]
+            missing = [sequence for sequence in missing if open_cached(sequence, sensor, folder) is None]
             _encode(missing, sensor, folder, workers, pool)
-    paths = [cache_path(sequence, sensor, folder) for sequence in sequences]
-    return [
-        EncodedSequence(
-            name=sequence.name,
-            key=path.stem,
-            scans=np.load(path, mmap_mode="r"),
-            poses=sequence.poses,
-            stamps=sequence.stamps,
-            camera_from_laser=sequence.camera_from_laser,
-            wheel_odometry=sequence.wheel_odometry,
+        scans = [open_cached(sequence, sensor, folder) for sequence in sequences]
+    encoded = []
+    for sequence, found in zip(sequences, scans, strict=True):
+        assert found is not None, sequence.name
+        encoded.append(
+            EncodedSequence(
+                name=sequence.name,
+                key=cache_path(sequence, sensor, folder).stem,
+                scans=found,
+                poses=sequence.poses,
+                stamps=sequence.stamps,
+                camera_from_laser=sequence.camera_from_laser,
+                wheel_odometry=sequence.wheel_odometry,
+            )
         )
-        for path, sequence in zip(paths, sequences, strict=True)
-    ]
+    return encoded
 
 
-def is_cached(sequence: Sequence, sensor: Sensor, folder: Path) -> bool:
-    """Whether all its depth vectors are in the cache."""
+def open_cached(sequence: Sequence, sensor: Sensor, folder: Path) -> npt.NDArray[np.float32] | None:
+    """A map of a sequence's depth vectors (N, bins) in the cache; None where they are not there.
+
+    The file is read once to compare its checksum: what a failing disk or a stranger has changed is told and
+    not used. Nothing in it is ever run.
+    """
     path = cache_path(sequence, sensor, folder)
     try:
-        return np.load(path, mmap_mode="r").shape == (len(sequence), sensor.bins)
+        with path.open("rb") as file:
+            body = path.stat().st_size - CHECKSUM().digest_size
+            checksum = _checksum(file, body)
+            whole = file.read() == checksum.digest()
+        scans = np.load(path, mmap_mode="r", allow_pickle=False) if whole else None
     except FileNotFoundError:
-        return False
-    except (ValueError, EOFError):
-        log.warning("%s: damaged, encoding it again", path)
-        return False
+        return None
+    except (ValueError, EOFError, OSError):
+        scans = None
+    if scans is not None and (scans.shape, scans.dtype) == ((len(sequence), sensor.bins), np.float32):
+        return scans
+    log.warning("%s: damaged or of an older version, encoding it again", path)
+    return None
+
+
+def _checksum(file: IO[bytes], size: int) -> "hashlib._Hash":
+    """Of as many bytes from the start of a file."""
+    file.seek(0)
+    checksum = CHECKSUM()
+    while size > 0 and (block := file.read(min(size, 1 << 20))):
+        checksum.update(block)
+        size -= len(block)
+    return checksum
 
 
 def _make_folder(folder: Path) -> None:
@@ -171,7 +201,7 @@ def _make_folder(folder: Path) -> None:
 def _encode(
     missing: list[Sequence], sensor: Sensor, folder: Path, workers: int, pool: Workers[Encoded] | None
 ) -> None:
-    if not missing:  # another process has been faster
+    if not missing:
         return
     lengths, total = [len(sequence) for sequence in missing], sum(map(len, missing))
     with ExitStack() as stack:
@@ -193,7 +223,7 @@ def _encode(
 
 
 class _PartialFile:
-    """An array (N, bins) on its way to disk: it gets its final name only when all of it is there.
+    """An array (N, bins) and its checksum on their way to disk, under the final name only when all is there.
 
     A killed run therefore leaves nothing that a later one would believe. It is not a memory map,
     because on a full disk that kills the process.
@@ -226,6 +256,7 @@ class _PartialFile:
                 file.seek(self.header + start * scans[0].nbytes)
                 file.write(scans.astype("<f4", copy=False).data)
                 if not self.missing:
+                    file.write(_checksum(file, file.seek(0, os.SEEK_END)).digest())
                     file.flush()
                     os.fsync(file.fileno())
             if not self.missing:

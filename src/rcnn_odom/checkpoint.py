@@ -1,6 +1,7 @@
 """Trained networks from disk, never trusting the file with more than numbers."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -8,7 +9,33 @@ import torch
 from rcnn_odom.cache import EncodedSequence
 from rcnn_odom.errors import InputError
 from rcnn_odom.modules import VARIANTS, OdometryModule
+from rcnn_odom.saving import save_atomically
 from rcnn_odom.scan import Sensor
+
+
+def read_checkpoint(path: str | Path) -> dict[str, Any]:
+    """What a checkpoint holds, its arrays as maps of the file.
+
+    Raises:
+        InputError: no such file, or it holds anything but numbers, strings, lists and dictionaries: objects
+            could run a stranger's code.
+    """
+    try:
+        saved = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
+        if not isinstance(saved, dict):
+            raise TypeError(f"it holds a {type(saved).__name__}")
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such checkpoint") from None
+    except Exception as error:  # whatever the bytes of a stranger's file lead to
+        raise _refusal(path, error) from error
+    return saved
+
+
+def _refusal(path: str | Path, error: Exception) -> InputError:
+    reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    return InputError(
+        f"{path}: not a checkpoint of this project, or of an older version ({reason}); train again"
+    )
 
 
 def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | None = None) -> OdometryModule:
@@ -22,21 +49,14 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
     Raises:
         InputError: no such file, not a checkpoint of this project, of another variant or sensor.
     """
+    saved = read_checkpoint(path)
     try:
-        saved = torch.load(path, map_location="cpu", weights_only=True)
-        if not isinstance(saved, dict):
-            raise TypeError(f"it holds a {type(saved).__name__}")
         settings, weights = saved["hyper_parameters"], saved["state_dict"]
         found = settings["variant"]
         module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
         module.load_state_dict(weights)
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such checkpoint") from None
-    except Exception as error:  # whatever the bytes of a stranger's file lead to
-        reason = f"{type(error).__name__}: {error}".splitlines()[0]
-        raise InputError(
-            f"{path}: not a checkpoint of this project, or of an older version ({reason}); train again"
-        ) from error
+    except Exception as error:  # whatever a stranger's file holds
+        raise _refusal(path, error) from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
     if sensor is not None and settings["sensor"] != sensor.as_dict():
@@ -69,9 +89,7 @@ def calibrate(path: str | Path, sequences: list[EncodedSequence]) -> OdometryMod
         np.concatenate([(sequence.scans > 0).mean(1) for sequence in sequences]),
         np.concatenate([np.diff(sequence.stamps) for sequence in sequences]),
     )
-    saved = torch.load(path, map_location="cpu", weights_only=True)
+    saved = read_checkpoint(path)
     saved["state_dict"] = module.state_dict()
-    partial = path.with_name(f".{path.name}.partial")
-    torch.save(saved, partial)
-    partial.replace(path)
+    save_atomically(saved, path)
     return module

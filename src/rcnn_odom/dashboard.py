@@ -5,6 +5,7 @@ from typing import Any
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torch.utils.tensorboard.summary import hparams
 
 from rcnn_odom.settings import Settings, flat
@@ -50,10 +51,17 @@ CHOSEN_AS = {"model.variant": "model", "data.name": "data"}
 class Layout(Callback):
     """Tells TensorBoard which scalars belong together."""
 
-    def on_fit_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Called once, before the first scalar."""
+        if not trainer.is_global_zero:
+            return
         assert isinstance(trainer.logger, TensorBoardLogger)
-        trainer.logger.experiment.add_custom_scalars(LAYOUT)
+        writer = trainer.logger.experiment
+        writer.add_custom_scalars(LAYOUT)
+        if trainer.global_step:
+            # A run that goes on will log what came after its checkpoint once more.
+            start = SessionLog(status=SessionLog.START)
+            writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
 
 
 def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, Any], step: int) -> None:

@@ -4,14 +4,15 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
+from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler
 
 from rcnn_odom.cache import EncodedSequence, encode_sequences
 from rcnn_odom.datasets.sequence import Sequence
@@ -46,16 +47,34 @@ class Windows(Dataset):
         self.first_frames = np.cumsum([0] + [len(sequence) for sequence in sequences])
 
     def __getitems__(self, draws: list[Draw]) -> Batch:
-        """A batch: ``pairs`` (B, T, 2, bins) in metres, ``motions`` (B, T, 2) in metres and radians."""
+        """A batch of windows.
+
+        Returns:
+            ``pairs`` (B, T, 2, bins) in metres, ``motions`` (B, T, 2) in metres and radians, and ``frames``
+            (B,), where the windows begin, of all drives laid end to end.
+        """
         pairs, motions = zip(*(self._window(*draw) for draw in draws), strict=True)
         return {
             "pairs": torch.from_numpy(np.stack(pairs)),
             "motions": torch.from_numpy(np.stack(motions).astype(np.float32)),
+            "frames": torch.tensor([frame for frame, _, _ in draws]),
         }
 
-    def _window(self, frame: int, seed: int, mirror: bool) -> tuple[np.ndarray, FloatArray]:
+    def describe(self, frames: list[int]) -> str:
+        """Which frames of which drives the windows that begin at these frames show, in words."""
+        ranges: dict[str, list[str]] = {}
+        for frame in sorted(frames):
+            sequence, start = self._locate(frame)
+            ranges.setdefault(sequence.name, []).append(f"{start}-{start + self.length}")
+        return "; ".join(f"{name}: {' '.join(its)}" for name, its in ranges.items())
+
+    def _locate(self, frame: int) -> tuple[EncodedSequence, int]:
+        """The drive that holds a frame of all, and the frame's place in it."""
         number = int(np.searchsorted(self.first_frames, frame, side="right")) - 1
-        sequence, start = self.sequences[number], frame - int(self.first_frames[number])
+        return self.sequences[number], frame - int(self.first_frames[number])
+
+    def _window(self, frame: int, seed: int, mirror: bool) -> tuple[np.ndarray, FloatArray]:
+        sequence, start = self._locate(frame)
         stop = start + self.length
         pairs = np.stack([sequence.scans[start:stop], sequence.scans[start + 1 : stop + 1]], axis=1)
         motions = sequence.motions[start:stop].copy()
@@ -139,6 +158,62 @@ class FreshSampler(WindowSampler):
         self.windows.sequences = self.worlds.of(epoch)
 
 
+class Batches(Sampler[list[Draw]]):
+    """Whole batches of draws, of which every process takes its share; an epoch can go on where it stopped.
+
+    Args:
+        sampler: of the draws. batch_size: windows in a batch, of all processes together.
+        rank: number of this process. processes: how many there are; they divide ``batch_size``.
+
+    Attributes:
+        given: batches of the present epoch that have been given away.
+    """
+
+    def __init__(self, sampler: WindowSampler, batch_size: int, rank: int = 0, processes: int = 1) -> None:
+        # Lightning tells `sampler` of every epoch.
+        self.sampler, self.batch_size, self.rank, self.processes = sampler, batch_size, rank, processes
+        self.given = 0
+        self._skipped = 0
+
+    def go_on_after(self, batches: int) -> None:
+        """Lets the next epoch that is asked for begin with a later batch."""
+        self._skipped = batches
+
+    def __len__(self) -> int:
+        return len(self.sampler) // self.batch_size
+
+    def __iter__(self) -> Iterator[list[Draw]]:
+        self.given, self._skipped = self._skipped, 0
+        batches = batched(self.sampler, self.batch_size)
+        for batch in islice(batches, self.given, len(self)):
+            self.given += 1
+            yield batch[self.rank :: self.processes]
+
+
+def batched(draws: Iterable[Draw], size: int) -> Iterator[list[Draw]]:
+    """Lists of as many draws; the last may be shorter."""
+    rest = iter(draws)
+    while batch := list(islice(rest, size)):
+        yield batch
+
+
+class TrainingLoader(DataLoader):
+    """A DataLoader that tells a checkpoint how far it has come.
+
+    Torchdata's would draw the batches to skip before Lightning has set the sampler's epoch.
+    """
+
+    batch_sampler: Batches
+
+    def state_dict(self) -> dict[str, int]:
+        """What a checkpoint keeps."""
+        return {"batches": self.batch_sampler.given}
+
+    def load_state_dict(self, state_dict: dict[str, int]) -> None:
+        """Goes on from a checkpoint's."""
+        self.batch_sampler.go_on_after(state_dict["batches"])
+
+
 class Drives(Dataset):
     """Whole sequences in order, each one item: its ``number`` and ``scans`` (N, bins) in metres."""
 
@@ -198,6 +273,7 @@ class OdometryDataModule(L.LightningDataModule):
         self.fresh_epochs, self.fresh_first = fresh_epochs, fresh_first
         self.keep_worlds = keep_worlds
         self.worlds: FreshWorlds | None = None
+        self.windows: Windows | None = None
 
     def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
         """Reads and encodes the sequences of these splits.
@@ -259,30 +335,45 @@ class OdometryDataModule(L.LightningDataModule):
         """
         sequences = self.sequences["train"]
         self._check_windows()
-        windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)
-        sampler: WindowSampler
+        self.windows = windows = Windows(sequences, self.sensor, self.window, self.max_turn_bins)
+        sampler = self._sampler()
+        rank, processes = self._place()
         if self.fresh_epochs:
             self.close()
+            # Several processes meet in the cache, where one of them has put the worlds.
+            kept = self.cache_dir if self.keep_worlds or processes > 1 else None
+            workers = 0 if rank else self.workers
             self.worlds = FreshWorlds(
-                self.read,
-                sequences,
-                self.fresh_epochs,
-                self.sensor,
-                self.workers,
-                self.fresh_first,
-                self.cache_dir if self.keep_worlds else None,
+                self.read, sequences, self.fresh_epochs, self.sensor, workers, self.fresh_first, kept
             )
             sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
-        else:
-            sampler = WindowSampler([len(s) for s in sequences], self.window, self.mirror, self.seed)
-        batch_size = min(self.batch_size, len(sampler))
+        batch_size = min(self.batch_size, len(sampler) // processes * processes)
         # A batch is gathered in one call, so there is nothing to collate; worker processes would only
         # copy what a memory map gives for nothing.
-        return DataLoader(
+        return TrainingLoader(
             windows,
-            batch_sampler=BatchSampler(sampler, batch_size, drop_last=True),  # type: ignore[arg-type]
+            batch_sampler=Batches(sampler, batch_size, rank, processes),  # type: ignore[arg-type]
             collate_fn=_as_is,
         )
+
+    def _sampler(self) -> WindowSampler:
+        lengths = [len(sequence) for sequence in self.sequences["train"]]
+        return WindowSampler(lengths, self.window, self.mirror, self.seed)
+
+    @property
+    def batches_per_epoch(self) -> int:
+        """Steps that an epoch takes."""
+        _, processes = self._place()
+        windows = len(self._sampler())
+        return windows // min(self.batch_size, windows // processes * processes)
+
+    def _place(self) -> tuple[int, int]:
+        """Number of this process among those that train, and how many these are."""
+        return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
+
+    def __getstate__(self) -> dict[str, Any]:
+        """What a process that trains needs: it finds the scans in the cache, instead of being sent them."""
+        return self.__dict__ | {"sequences": {}, "worlds": None, "windows": None}
 
     def close(self) -> None:
         """Ends what is being made of new worlds."""
@@ -298,12 +389,19 @@ class OdometryDataModule(L.LightningDataModule):
         self.close()
 
     def val_dataloader(self) -> DataLoader:
-        """Whole validation sequences, one an item."""
-        return DataLoader(Drives(self.sequences["val"]), batch_size=None)
+        """Whole validation sequences, one an item; several processes share them."""
+        return self._drives("val")
 
     def test_dataloader(self) -> DataLoader:
-        """Whole test sequences, one an item."""
-        return DataLoader(Drives(self.sequences["test"]), batch_size=None)
+        """Whole test sequences, one an item; several processes share them."""
+        return self._drives("test")
+
+    def _drives(self, split: str) -> DataLoader:
+        drives = Drives(self.sequences[split])
+        rank, processes = self._place()
+        # Some come twice where they do not come out even, so that no process waits for one that has none.
+        sampler: Sampler[int] = DistributedSampler(drives, processes, rank, shuffle=False)
+        return DataLoader(drives, sampler=sampler, batch_size=None)
 
 
 def _as_is(batch: Any) -> Any:

@@ -4,29 +4,33 @@ import json
 import logging
 import shutil
 import sys
-import time
 import warnings
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import lightning as L
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import Callback, ModelCheckpoint
+from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
-from rcnn_odom.checkpoint import calibrate, load_module
+from rcnn_odom.checkpoint import calibrate, load_module, read_checkpoint
 from rcnn_odom.dashboard import Layout, log_run
 from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation import Report, percent
+from rcnn_odom.evaluation import Report
 from rcnn_odom.lock import one_at_a_time
 from rcnn_odom.machine import keep_freed_memory, resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
+from rcnn_odom.processes import one_line_errors
 from rcnn_odom.report import Estimates, report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
+from rcnn_odom.saving import AtomicCheckpointIO, Saving
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
+from rcnn_odom.training_log import TrainingLog
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
@@ -75,48 +79,6 @@ def build_module(settings: Settings, datamodule: OdometryDataModule) -> Odometry
     return module
 
 
-class EpochLines(Callback):
-    """A line for each epoch, which a progress bar would not leave behind in a log; and the time it took.
-
-    Attributes:
-        seconds: of training and validation up to the end of the last epoch, in all sittings.
-    """
-
-    def __init__(self) -> None:
-        self.seconds = 0.0
-
-    def state_dict(self) -> dict[str, float]:
-        """What a checkpoint keeps."""
-        return {"seconds": time.monotonic() - self.begun}
-
-    def load_state_dict(self, state_dict: dict[str, float]) -> None:
-        """Goes on from a checkpoint's."""
-        self.seconds = state_dict["seconds"]
-
-    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Starts the clock."""
-        self.begun = time.monotonic() - self.seconds
-
-    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Called after the epoch's validation."""
-        self.seconds = time.monotonic() - self.begun
-        values = {name: float(value) for name, value in trainer.callback_metrics.items()}
-        worlds = trainer.datamodule.worlds  # type: ignore[attr-defined]
-        waited = f"  waited {worlds.waited:.0f} s for new worlds" if worlds and worlds.waited > 0.5 else ""
-        log.info(
-            "epoch %2d/%d  loss %.4f  validation: drift %5s %%, mean error a frame %.3f m %.3f deg  %4.0f s"
-            "%s",
-            trainer.current_epoch + 1,
-            trainer.max_epochs,
-            values["train/loss_epoch"],
-            percent(values.get("val/drift")),
-            values["val/distance_mae_m"],
-            values["val/heading_mae_deg"],
-            self.seconds,
-            waited,
-        )
-
-
 def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     """Lightning's Trainer for a run's folder; without one, a Trainer that can only test.
 
@@ -125,13 +87,18 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     """
     options = dict(settings["trainer"])
     options["precision"] = resolve_precision(options["precision"], options["accelerator"])
-    if options["devices"] != 1:
-        raise InputError(f"trainer.devices={options['devices']}: one device is supported, trainer.devices=1")
+    if options["devices"] != 1 and "strategy" not in options:
+        raise InputError(
+            f"trainer.devices={options['devices']}: several devices train by trainer=ddp trainer.devices=..."
+        )
     keep_freed_memory()
     try:
-        return L.Trainer(
+        trainer = L.Trainer(
             **options,
             **(_training_options(settings, run) if run else {"logger": False, "enable_checkpointing": False}),
+            # Processes are started by this one wherever it runs, also in a job of Slurm.
+            plugins=[LightningEnvironment(), AtomicCheckpointIO()],
+            use_distributed_sampler=False,
             enable_model_summary=False,
             enable_progress_bar=sys.stderr.isatty(),
         )
@@ -139,20 +106,29 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
         reason = " ".join(str(error).split()).split(". ")[0]
         advice = "trainer.accelerator=cpu with trainer.precision=auto runs everywhere"
         raise InputError(f"trainer: {reason}; {advice}") from error
+    batch_size, devices = settings["model"]["batch_size"], trainer.world_size
+    if run and batch_size % devices:
+        raise InputError(
+            f"model.batch_size={batch_size}: windows cannot be shared evenly among {devices} devices; set a "
+            f"multiple of {devices}"
+        )
+    return trainer
 
 
 def _training_options(settings: Settings, run: Path) -> Settings:
-    folder = (run / BEST).parent
     best = ModelCheckpoint(
-        folder, "best", monitor="val/drift", save_weights_only=True, enable_version_counter=False
+        (run / BEST).parent,
+        "best",
+        monitor="val/drift",
+        save_weights_only=True,
+        enable_version_counter=False,
+        save_on_train_epoch_end=False,
     )
-    last = ModelCheckpoint(folder, "last", enable_version_counter=False)
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [EpochLines(), Layout(), best, last],
+        "callbacks": [Layout(), TrainingLog(), best, Saving(run / LAST)],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
-        "log_every_n_steps": 10,
     }
 
 
@@ -161,7 +137,7 @@ def train_module(
 ) -> Report:
     """Trains one module, a recurrent one's first stage before it, and scores it on the test sequences.
 
-    A run that was stopped goes on after its last whole epoch.
+    A run that was stopped or killed goes on from its last checkpoint, to the very same result on a CPU.
 
     Args:
         settings: of the run.
@@ -179,10 +155,10 @@ def train_module(
     if twin:
         metrics |= _take_weights(twin, run)
     else:
-        metrics |= _fit(settings, datamodule, trainer)
+        metrics |= _fit(settings, datamodule, trainer, metrics["fingerprint"])
     metrics |= finish_run(settings, datamodule, trainer, run)
     assert isinstance(trainer.logger, TensorBoardLogger)
-    log_run(trainer.logger, settings, metrics, trainer.global_step)
+    log_run(trainer.logger, settings, metrics, settings["model"]["epochs"] * datamodule.batches_per_epoch)
     write_json(run / METRICS, metrics)
     (run / LAST).unlink(missing_ok=True)
     return metrics
@@ -198,26 +174,38 @@ def _take_weights(twin: Path, run: Path) -> Report:
     return {**kept, "same_as": told.get("same_as", str(twin.parents[1]))}
 
 
-def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer) -> Report:
-    """Trains; the part of ``metrics.json`` that is about it."""
+def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, wanted: str) -> Report:
+    """Trains; the part of ``metrics.json`` that is about it.
+
+    Raises:
+        InputError: the checkpoint that it would go on from belongs to another training.
+    """
     metrics: Report = {}
     last = Path(settings["run_dir"]) / LAST
     module = build_module(settings, datamodule)
+    module.fingerprint = wanted
     if isinstance(module, RecurrentModule):
         path, cnn = first_stage(settings, datamodule)
         module.load_first_stage(cnn)
         metrics["first_stage"] = str(path)
     if last.exists():
-        log.info("going on from %s", last)
-    trainer.fit(module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True)
-    best = trainer.checkpoint_callback
-    assert isinstance(best, ModelCheckpoint)
-    callbacks: list[Callback] = trainer.callbacks  # type: ignore[attr-defined]
-    clock = next(callback for callback in callbacks if isinstance(callback, EpochLines))
-    drift = best.best_model_score
+        saved = read_checkpoint(last)
+        if saved.get("fingerprint") != wanted:
+            raise InputError(
+                f"{last}: saved by a training on other recordings or with another version of rcnn_odom; "
+                "choose another run_dir, or remove it to begin again"
+            )
+        log.info("going on from %s, step %d", last, saved["global_step"])
+    with one_line_errors(trainer):
+        trainer.fit(
+            module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
+        )
+    saved = read_checkpoint(last)  # where training in other processes has left it too
+    (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("ModelCheckpoint"))
+    drift = best["best_model_score"]
     return {
         **metrics,
-        "training": {"seconds": clock.seconds, "epochs": settings["model"]["epochs"]},
+        "training": {"seconds": saved["training_log"]["seconds"], "epochs": settings["model"]["epochs"]},
         "val": {"drift": None if drift is None else float(drift), "lengths": module.scoring["lengths"]},
     }
 
@@ -240,7 +228,12 @@ def finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Tr
 
 def estimate_test(module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer) -> Estimates:
     """What a network makes of the test sequences."""
-    trainer.test(module, datamodule=datamodule, verbose=False)
+    with TemporaryDirectory() as folder, one_line_errors(trainer):
+        # Other processes cannot hand their estimates over in memory.
+        module.estimates_file = Path(folder) / "estimates.npz" if trainer.world_size > 1 else None
+        trainer.test(module, datamodule=datamodule, verbose=False)
+        if module.estimates_file:
+            module.load_estimates()
     drives = {s.name: module.estimates[number] for number, s in enumerate(datamodule.sequences["test"])}
     motions = {name: drive.motions for name, drive in drives.items()}
     deviations = {name: drive.deviations for name, drive in drives.items()}

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive, encode_sequences, is_cached
+from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive, cache_path, encode_sequences
 from rcnn_odom.scan import Sensor
 from rcnn_odom.workers import Workers, useful_workers
 
@@ -16,6 +16,8 @@ log = logging.getLogger(__name__)
 
 NICENESS = 10
 """Training comes first: what it leaves of the processor makes worlds."""
+POLLING = 0.2
+"""Seconds between looks for the worlds that another process makes."""
 
 
 class FreshWorlds:
@@ -30,7 +32,7 @@ class FreshWorlds:
         drives: the training set.
         epochs: of this stage's training.
         sensor: theirs.
-        workers: processes.
+        workers: processes; 0: another process with the same cache makes the worlds.
         first: epochs of the stage before, so that a second stage has other worlds than the first one.
         cache: folder where the worlds are kept for other trainings; None: in memory alone.
     """
@@ -47,7 +49,7 @@ class FreshWorlds:
     ) -> None:
         self.read, self.drives, self.epochs, self.sensor, self.first = read, drives, epochs, sensor, first
         self.cache = cache
-        self.worker_count = useful_workers(workers, sum(map(len, drives)))
+        self.worker_count = useful_workers(workers, sum(map(len, drives))) if workers else 0
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
         self._workers: Workers[Encoded] | None = None
@@ -62,7 +64,7 @@ class FreshWorlds:
             InputError: a drive cannot be made.
         """
         wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
-        if self._workers is None and not all(map(self._is_kept, wanted)):
+        if self.worker_count and self._workers is None and not all(map(self._is_kept, wanted)):
             log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
             self._workers = Workers(self.worker_count, Encoding(self.read, self.sensor), NICENESS)
         self._made = {e: self._made.get(e) or self._maker.submit(self._make, e) for e in wanted}
@@ -76,14 +78,16 @@ class FreshWorlds:
 
     def _is_kept(self, epoch: int) -> bool:
         return self.cache is not None and all(
-            is_cached(self.read(name), self.sensor, self.cache) for name in self._names(epoch)
+            cache_path(self.read(name), self.sensor, self.cache).exists() for name in self._names(epoch)
         )
 
     def _make(self, epoch: int) -> list[EncodedSequence]:
         names = self._names(epoch)
         if self.cache is not None:
+            while not (self.worker_count or self._is_kept(epoch)):
+                time.sleep(POLLING)
             worlds = [self.read(name) for name in names]
-            return encode_sequences(worlds, self.sensor, self.cache, self.worker_count, self._workers)
+            return encode_sequences(worlds, self.sensor, self.cache, max(1, self.worker_count), self._workers)
         assert self._workers is not None
         scans = [np.empty(drive.scans.shape, np.float32) for drive in self.drives]
         poses = [np.empty_like(drive.poses) for drive in self.drives]

@@ -3,6 +3,7 @@
 import logging
 import os
 import re
+import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
@@ -86,6 +87,7 @@ def run_command(main: Callable[[], object]) -> int:
     """Runs a function decorated with ``hydra.main``; the exit status: 1 after a mistake of the user."""
     # Hydra would print and exit by itself, also where a folder cannot be made.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     try:
         main()
     except KeyboardInterrupt:

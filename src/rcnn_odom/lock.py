@@ -33,3 +33,18 @@ def one_at_a_time(folder: Path, work: str, what: str) -> Iterator[None]:
         yield
     finally:
         lock.release()
+
+
+@contextmanager
+def held(path: Path) -> Iterator[bool]:
+    """Holds a lock if no other process does, which is the value; the lock ends with its process."""
+    lock = FileLock(path)
+    try:
+        lock.acquire(timeout=0)
+    except Timeout:
+        yield False
+        return
+    try:
+        yield True
+    finally:
+        lock.release()

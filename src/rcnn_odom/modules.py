@@ -1,18 +1,17 @@
 """The four variants of the paper as LightningModules."""
 
+from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
 import lightning as L
 import numpy as np
 import torch
 from torch import Tensor
-from torchmetrics import MeanMetric
 
-from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.datamodule import Batch
+from rcnn_odom.datamodule import Batch, OdometryDataModule
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import camera_trajectory, frame_errors
-from rcnn_odom.losses import Loss, classification_loss, regression_loss
+from rcnn_odom.losses import classification_loss, regression_loss
 from rcnn_odom.metrics.module import DriftMetric
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.networks import CNN, RCNN, RotationClasses
@@ -63,7 +62,10 @@ class OdometryModule(L.LightningModule):
         self.network = self._build()
         self.uncertainty = Uncertainty(self.recurrent)
         self.estimates: dict[int, DriveEstimate] = {}
-        self.outside = MeanMetric()
+        self.estimates_file: Path | None = None
+        """Where a test in other processes leaves its estimates."""
+        self.fingerprint = ""
+        """Of the training, for its checkpoints: see :func:`rcnn_odom.runs.fingerprint`."""
 
     def _build(self) -> CNN | RCNN:
         model = self.model
@@ -92,28 +94,36 @@ class OdometryModule(L.LightningModule):
             head.mean.copy_(torch.from_numpy(mean))
             head.deviation.copy_(torch.from_numpy(deviation))
 
-    def training_step(self, batch: Batch, batch_idx: int) -> Tensor:
-        """The loss of one batch of windows, and its parts into the log."""
+    def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
+        """Makes dropout a function of the step, so that a training that goes on draws what it would have."""
+        drawn_from = [self._data.seed, self.global_step, self.global_rank]
+        torch.manual_seed(int(np.random.SeedSequence(drawn_from).generate_state(1)[0]))
+
+    def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
+        """The loss of one batch of windows and its parts, scalars.
+
+        Raises:
+            InputError: the loss is nan or inf.
+        """
         truth = batch["motions"]
         estimate, _ = self.network(batch["pairs"])
         beta, per_sample = self.model["beta"], self.model["per_sample_norm"]
+        outside = {}
         if estimate.scores is None:
             loss = regression_loss(estimate.motion, truth, beta, per_sample)
         else:
             classes = self.classes.index(truth[..., 1])
             loss = classification_loss(estimate.motion, estimate.scores, truth, classes, beta, per_sample)
-            self.outside(self.classes.outside(truth[..., 1]) / truth[..., 1].numel())
-            self.log("train/headings_outside_classes", self.outside, on_step=False, on_epoch=True)
-        self._log_losses(loss, len(truth))
-        return loss.total
-
-    def _log_losses(self, loss: Loss, batch_size: int) -> None:
-        parts = {"train/loss": loss.total, "train/loss_distance": loss.distance}
-        parts["train/loss_rotation"] = loss.rotation
-        self.log_dict(parts, on_step=True, on_epoch=True, batch_size=batch_size)
-        self.log(
-            "train/learning_rate", self.trainer.optimizers[0].param_groups[0]["lr"], batch_size=batch_size
-        )
+            share = self.classes.outside(truth[..., 1]) / truth[..., 1].numel()
+            outside = {"headings_outside_classes": share}
+        self._trained_on = batch["frames"]
+        if not loss.total.isfinite():
+            finite = estimate.motion.isfinite().all(-1).all(-1)
+            # One bad window spoils the mean of all: the estimates tell which it is.
+            self._trained_on = batch["frames"] if finite.all() else batch["frames"][~finite]
+            raise self._diverged("the loss is nan or inf")
+        parts = {"loss_distance": loss.distance, "loss_rotation": loss.rotation}
+        return {"loss": loss.total, **parts, **outside}
 
     def configure_gradient_clipping(
         self,
@@ -125,9 +135,34 @@ class OdometryModule(L.LightningModule):
 
         Lightning refuses to with a fused optimiser under mixed precision, because of the loss scaling of
         fp16, which bf16 does without.
+
+        Raises:
+            InputError: the gradient is nan or inf; the weights are still good.
         """
-        if gradient_clip_val is not None:
-            torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val)
+        norm = torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val or float("inf"))
+        if not norm.isfinite():
+            raise self._diverged("the gradient is nan or inf")
+
+    def check_weights(self) -> None:
+        """Looks for nan and inf before the weights are kept.
+
+        Raises:
+            InputError: there are some.
+        """
+        if not all(parameter.isfinite().all() for parameter in self.parameters()):
+            raise self._diverged("a weight is nan or inf")
+
+    def _diverged(self, what: str) -> InputError:
+        windows = self._data.windows
+        frames = windows.describe(self._trained_on.tolist()) if windows else "unknown"
+        return InputError(
+            f"training diverged in epoch {self.current_epoch + 1}, step {self.global_step + 1}: {what}, after "
+            f"frames {frames}; look at these, or set model.learning_rate lower"
+        )
+
+    @property
+    def _data(self) -> OdometryDataModule:
+        return self.trainer.datamodule  # type: ignore[attr-defined,no-any-return]
 
     @torch.no_grad()
     def estimate(self, scans: Tensor) -> DriveEstimate:
@@ -148,38 +183,38 @@ class OdometryModule(L.LightningModule):
         difficulties = np.concatenate(features)
         return DriveEstimate(np.concatenate(motions), difficulties @ weights.T, difficulties)
 
-    def _validation(self) -> list[EncodedSequence]:
-        return self.trainer.datamodule.sequences["val"]  # type: ignore[attr-defined]
-
     def on_validation_epoch_start(self) -> None:
-        """A metric for this epoch alone."""
-        names = [sequence.name for sequence in self._validation()]
-        self.drift = DriftMetric(names, lengths=self.scoring["lengths"], planar=True).to(self.device)
+        """Forgets the estimates of the epoch before."""
+        self.estimates = {}
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Scores one whole sequence.
+        """Keeps the estimate of one whole sequence.
 
         Raises:
             InputError: training has diverged.
         """
-        sequence = self._validation()[batch["number"]]
-        motions = self.estimate(batch["scans"]).motions
-        if not np.isfinite(motions).all():
-            raise InputError(
-                f"training diverged in epoch {self.current_epoch + 1}: {sequence.name} is estimated as nan "
-                "or inf; set model.learning_rate lower"
-            )
-        estimate = camera_trajectory(sequence, motions, self.scoring["apply"])
-        self.drift.update(sequence.camera_poses, estimate, sequence.name)
-        errors = frame_errors(motions, sequence.motions)
-        frames = len(motions)
-        self.log("val/distance_mae_m", errors["distance_mae_m"], batch_size=frames)
-        self.log("val/heading_mae_deg", errors["heading_mae_deg"], batch_size=frames)
+        estimate = self.estimate(batch["scans"])
+        if not np.isfinite(estimate.motions).all():
+            raise self._diverged("validation is estimated as nan or inf")
+        self.estimates[batch["number"]] = estimate
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the drift of each validation sequence and their mean."""
-        for name, value in self.drift.compute().items():
+        """Logs the drift of each validation sequence and their mean, and the mean errors of a frame."""
+        self._gather_estimates()
+        sequences = self._data.sequences["val"]
+        names = [sequence.name for sequence in sequences]
+        drift = DriftMetric(names, lengths=self.scoring["lengths"], planar=True)
+        errors, frames = [], []
+        for number, estimate in sorted(self.estimates.items()):
+            sequence = sequences[number]
+            poses = camera_trajectory(sequence, estimate.motions, self.scoring["apply"])
+            drift.update(sequence.camera_poses, poses, sequence.name)
+            errors.append(frame_errors(estimate.motions, sequence.motions))
+            frames.append(len(estimate.motions))
+        for name, value in drift.compute().items():
             self.log(f"val/{name}", value)
+        for name in ("distance_mae_m", "heading_mae_deg"):
+            self.log(f"val/{name}", float(np.average([error[name] for error in errors], weights=frames)))
 
     def on_test_epoch_start(self) -> None:
         """Forgets the estimates of an earlier test."""
@@ -189,14 +224,46 @@ class OdometryModule(L.LightningModule):
         """Keeps the estimate of one whole sequence; ``rcnn_odom.evaluation`` scores it."""
         self.estimates[batch["number"]] = self.estimate(batch["scans"])
 
+    def on_test_epoch_end(self) -> None:
+        """Every process gets the estimates of all, and one leaves them in ``estimates_file``."""
+        self._gather_estimates()
+        if self.estimates_file and self.global_rank == 0:
+            arrays = {
+                f"{number}/{name}": array
+                for number, drive in self.estimates.items()
+                for name, array in drive._asdict().items()
+            }
+            np.savez(self.estimates_file, **arrays)
+
+    def load_estimates(self) -> None:
+        """Takes what a test in other processes has left in ``estimates_file``."""
+        assert self.estimates_file is not None
+        with np.load(self.estimates_file) as arrays:
+            numbers = {name.split("/")[0] for name in arrays}
+            self.estimates = {
+                int(number): DriveEstimate(*(arrays[f"{number}/{name}"] for name in DriveEstimate._fields))
+                for number in numbers
+            }
+
+    def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
+        """Signs the checkpoint."""
+        checkpoint["fingerprint"] = self.fingerprint
+
+    def _gather_estimates(self) -> None:
+        """Shares estimates among processes; a sequence that two of them have counts once."""
+        if self.trainer.world_size > 1:
+            shares: list[Any] = [None] * self.trainer.world_size
+            torch.distributed.all_gather_object(shares, self.estimates)
+            self.estimates = {number: drive for share in shares for number, drive in share.items()}
+
     def configure_optimizers(self) -> Any:
         """Adam with a one-cycle rate over the whole training."""
-        model = self.model
-        optimizer = torch.optim.Adam(
-            [p for p in self.parameters() if p.requires_grad], lr=model["learning_rate"], fused=True
-        )
-        steps = int(self.trainer.estimated_stepping_batches)
-        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, model["learning_rate"], total_steps=steps)
+        rate = self.model["learning_rate"]
+        optimizer = torch.optim.Adam([p for p in self.parameters() if p.requires_grad], lr=rate, fused=True)
+        # Not the trainer's own count, which makes the loader before a checkpoint can tell it where to go on.
+        assert self.trainer.max_epochs is not None
+        steps = self.trainer.max_epochs * self._data.batches_per_epoch
+        schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 

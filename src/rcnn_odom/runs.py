@@ -4,22 +4,29 @@ import hashlib
 import json
 import logging
 import os
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import yaml
 
-from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
+from rcnn_odom.lock import held
 from rcnn_odom.settings import Settings
+
+if TYPE_CHECKING:  # torch would make --help slow
+    from rcnn_odom.datamodule import OdometryDataModule
 
 log = logging.getLogger(__name__)
 
-RECIPE_VERSION = 2
+RECIPE_VERSION = 3
 """Raised whenever the same settings train another network, so that an older first stage is not taken."""
 
 CONFIG, METRICS = "config.yaml", "metrics.json"
+RUNNING = ".running.lock"
+"""Held while a run is trained."""
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
 
 
@@ -41,6 +48,32 @@ def start_run(run: Path, settings: Settings) -> None:
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
     log.info("run %s, seed %d", run, settings["seed"])
+
+
+@contextmanager
+def claimed(run: Path) -> Iterator[None]:
+    """Keeps other processes away from a run while it is trained.
+
+    Raises:
+        InputError: another process trains it.
+    """
+    with held(run / RUNNING) as mine:
+        if not mine:
+            raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
+        yield
+
+
+def find_stopped(folder: Path, settings: Settings) -> Path | None:
+    """The newest run in a folder that was begun with these settings, is not finished, and runs no more."""
+    runs = [config.parent for config in folder.glob(f"*/{CONFIG}")]
+    for run in sorted(runs, key=lambda run: (run / CONFIG).stat().st_mtime, reverse=True):
+        with suppress(InputError, OSError):  # of a stranger's folder
+            if (run / METRICS).exists() or not _same(read_settings(run), settings):
+                continue
+            with held(run / RUNNING) as stopped:
+                if stopped:
+                    return run
+    return None
 
 
 def finished(run: Path, settings: Settings) -> dict[str, Any] | None:
@@ -91,7 +124,7 @@ def read_settings(run: Path) -> Settings:
     return settings
 
 
-def fingerprint(settings: Settings, datamodule: OdometryDataModule) -> str:
+def fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
     """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
     recordings = {
         split: [

@@ -1,0 +1,63 @@
+"""Training in several processes that Lightning starts: their errors and signals, as if there were one."""
+
+import multiprocessing
+import signal
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+import lightning as L
+from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.saving import SIGNALS, Stopped
+
+
+@contextmanager
+def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
+    """Around a trainer's work, which it may do in other processes.
+
+    Raises:
+        InputError: one of them met a mistake of the user, or was killed.
+        Stopped: they were asked to stop, and have saved.
+    """
+    with _signals_passed_on(trainer):
+        try:
+            yield
+        except ProcessRaisedException as error:
+            for line in str(error).splitlines():
+                kind, _, message = line.partition(":")
+                if kind == f"{InputError.__module__}.{InputError.__name__}":
+                    raise InputError(message.strip()) from error
+                if kind == f"{Stopped.__module__}.{Stopped.__name__}":
+                    raise Stopped from error
+            raise
+        except ProcessExitedException as error:
+            raise InputError(
+                "a training process was killed, perhaps for want of memory; the same command goes on from "
+                "the last checkpoint"
+            ) from error
+
+
+@contextmanager
+def _signals_passed_on(trainer: L.Trainer) -> Iterator[None]:
+    """Lets the processes that train save and stop, instead of ending the one that waits for them."""
+    if trainer.world_size == 1:
+        yield
+        return
+    asked = False
+
+    def pass_on(number: int, frame: object) -> None:
+        nonlocal asked
+        processes = multiprocessing.active_children()
+        if asked or not processes:
+            raise KeyboardInterrupt
+        asked = True
+        for process in processes:
+            process.terminate()
+
+    before = {number: signal.signal(number, pass_on) for number in SIGNALS}
+    try:
+        yield
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)

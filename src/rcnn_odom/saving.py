@@ -1,0 +1,158 @@
+"""What keeps a training safe: checkpoints that are whole or not there, saved often and before it stops."""
+
+import logging
+import multiprocessing
+import os
+import signal
+import threading
+import time
+from pathlib import Path
+from typing import Any
+
+import lightning as L
+import torch
+from lightning.fabric.plugins.io import TorchCheckpointIO
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+
+from rcnn_odom.errors import InputError
+
+log = logging.getLogger(__name__)
+
+EVERY = 60.0
+"""Seconds between checkpoints within an epoch; saving the largest network takes less than one."""
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+NOTHING, SAVE, STOP = 0, 1, 2
+
+
+def starter_lives() -> bool:
+    """Whether this process was started by another one that is still there."""
+    starter = multiprocessing.parent_process()
+    return starter is not None and starter.pid == os.getppid()
+
+
+class Stopped(Exception):
+    """Training was asked to stop, and has saved what it needs to go on."""
+
+
+def save_atomically(content: dict[str, Any], path: Path) -> None:
+    """Writes numbers for ``torch.load(path, weights_only=True)``, at once or not at all.
+
+    Raises:
+        InputError: it cannot be written; what was there before still is.
+    """
+    partial = path.with_name(f".{path.name}.partial")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with partial.open("wb") as file:
+            torch.save(content, file)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    except (OSError, RuntimeError) as error:  # torch's writer turns an OSError into the latter
+        partial.unlink(missing_ok=True)
+        cause = error.__context__ if isinstance(error.__context__, OSError) else error
+        reason = cause.strerror if isinstance(cause, OSError) else str(error).splitlines()[0]
+        kept = "the one before is kept; " if path.exists() else ""
+        raise InputError(
+            f"{path}: checkpoint cannot be written ({reason}); {kept}make room there, and the same command "
+            "goes on"
+        ) from error
+
+
+class AtomicCheckpointIO(TorchCheckpointIO):
+    """Lightning's checkpoints by :func:`save_atomically`; its own may end half-written on another disk."""
+
+    def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
+        """Called by the Trainer on the process that writes."""
+        save_atomically(checkpoint, Path(path))
+
+
+class Saving(Callback):
+    """Saves everything that a training needs to go on bit for bit, and stops it when it is asked to.
+
+    A checkpoint is written at the end of every epoch, every ``EVERY`` seconds within one, and at the first
+    Ctrl-C or SIGTERM, which lets a step or a validation under way come to its end. A second one stops at
+    once.
+
+    Args:
+        path: of the checkpoint.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path = path
+        self._asked = False
+        self._within_epoch = False
+        self._saved = 0.0
+        self._handlers: dict[signal.Signals, Any] = {}
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Listens to the signals from now on."""
+        self._saved = time.monotonic()
+        self._several = trainer.world_size > 1
+        if threading.current_thread() is threading.main_thread():  # no other can
+            self._handlers = {number: signal.signal(number, self._ask) for number in SIGNALS}
+
+    def _ask(self, number: int, frame: object) -> None:
+        if number == signal.SIGINT and self._several and starter_lives():
+            return  # Ctrl-C reaches all processes of a terminal; the one that started this one passes it on
+        if self._asked or not self._within_epoch:
+            raise KeyboardInterrupt
+        self._asked = True
+        log.info("stopping as soon as this step or validation is done and saved")
+
+    def on_train_batch_start(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
+    ) -> None:
+        """From here to the end of the epoch stopping has to wait for a moment that can be saved."""
+        self._within_epoch = True
+
+    def on_train_batch_end(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
+    ) -> None:
+        """A moment that can be saved, except right before the validation, which belongs to the epoch."""
+        if trainer.is_last_batch:
+            return
+        due = SAVE if time.monotonic() - self._saved > EVERY else NOTHING
+        wanted = self._agree(trainer, STOP if self._asked else due)
+        if wanted:
+            self._save(trainer)
+        if wanted == STOP:
+            raise Stopped
+
+    def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Called after the validation."""
+        self._save(trainer)
+        self._within_epoch = False
+        if self._agree(trainer, STOP if self._asked else NOTHING) == STOP:
+            raise Stopped
+
+    def _agree(self, trainer: L.Trainer, wanted: int) -> int:
+        """The most that any of the processes wants, so that all do the same."""
+        if trainer.world_size == 1:
+            return wanted
+        told = torch.tensor(wanted, device=trainer.strategy.root_device)
+        return int(trainer.strategy.reduce(told, reduce_op="max"))
+
+    def _save(self, trainer: L.Trainer) -> None:
+        trainer.lightning_module.check_weights()  # type: ignore[operator]
+        if trainer.is_global_zero:
+            # What has been logged up to this step must not be lost either: it will not be logged again.
+            assert isinstance(trainer.logger, TensorBoardLogger)
+            trainer.logger.experiment.flush()
+        trainer.save_checkpoint(self.path)
+        self._saved = time.monotonic()
+
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Gives the signals back."""
+        self._restore()
+
+    def on_exception(
+        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
+    ) -> None:
+        """Gives the signals back."""
+        self._restore()
+
+    def _restore(self) -> None:
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())
