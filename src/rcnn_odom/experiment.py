@@ -4,7 +4,6 @@ import json
 import logging
 import shutil
 import sys
-import warnings
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -21,7 +20,7 @@ from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import Report
 from rcnn_odom.lock import one_at_a_time
-from rcnn_odom.machine import keep_freed_memory, resolve_precision
+from rcnn_odom.machine import resolve_precision
 from rcnn_odom.metrics.drift import fitting_lengths
 from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
 from rcnn_odom.processes import one_line_errors
@@ -34,9 +33,6 @@ from rcnn_odom.training_log import TrainingLog
 from rcnn_odom.trajectory import flatten
 
 log = logging.getLogger(__name__)
-# Lightning tells of the machine and of its makers' products; what a user needs is said by this project.
-logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
-warnings.filterwarnings("ignore", module=r"lightning\.pytorch")
 
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
@@ -91,7 +87,6 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
         raise InputError(
             f"trainer.devices={options['devices']}: several devices train by trainer=ddp trainer.devices=..."
         )
-    keep_freed_memory()
     try:
         trainer = L.Trainer(
             **options,

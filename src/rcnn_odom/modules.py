@@ -12,6 +12,7 @@ from rcnn_odom.datamodule import Batch, OdometryDataModule
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation import camera_trajectory, frame_errors
 from rcnn_odom.losses import classification_loss, regression_loss
+from rcnn_odom.machine import keep_freed_memory
 from rcnn_odom.metrics.module import DriftMetric
 from rcnn_odom.motion import FloatArray
 from rcnn_odom.networks import CNN, RCNN, RotationClasses
@@ -94,6 +95,10 @@ class OdometryModule(L.LightningModule):
             head.mean.copy_(torch.from_numpy(mean))
             head.deviation.copy_(torch.from_numpy(deviation))
 
+    def setup(self, stage: str) -> None:
+        """Lightning's hook, in every process that trains or tests."""
+        keep_freed_memory()
+
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Makes dropout a function of the step, so that a training that goes on draws what it would have."""
         drawn_from = [self._data.seed, self.global_step, self.global_rank]
@@ -156,8 +161,8 @@ class OdometryModule(L.LightningModule):
         windows = self._data.windows
         frames = windows.describe(self._trained_on.tolist()) if windows else "unknown"
         return InputError(
-            f"training diverged in epoch {self.current_epoch + 1}, step {self.global_step + 1}: {what}, after "
-            f"frames {frames}; look at these, or set model.learning_rate lower"
+            f"training diverged in epoch {self.current_epoch + 1}, step {self.global_step + 1}: {what}, "
+            f"after frames {frames}; look at these, or set model.learning_rate lower"
         )
 
     @property

@@ -1,7 +1,9 @@
 """What a training says of itself: a line and a point on every curve for each epoch."""
 
 import logging
+import sys
 import time
+import warnings
 from typing import Any
 
 import lightning as L
@@ -11,6 +13,10 @@ from lightning.pytorch.callbacks import Callback
 from rcnn_odom.evaluation import percent
 
 log = logging.getLogger(__name__)
+# Lightning tells of the machine and of its makers' products; what a user needs is said by this project.
+for library in ("lightning.pytorch", "lightning.fabric"):
+    logging.getLogger(library).setLevel(logging.WARNING)
+    warnings.filterwarnings("ignore", module=library.replace(".", r"\."))
 
 EVERY = 10
 """Steps from one point of a step's own curves to the next."""
@@ -30,6 +36,20 @@ class TrainingLog(Callback):
         self.seconds = 0.0
         self._sums: dict[str, float] = {}
         self._windows = 0
+        self._files: list[str] = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Also tells a process that trains which files this one writes its messages to."""
+        handlers = logging.getLogger().handlers
+        files = [handler.baseFilename for handler in handlers if isinstance(handler, logging.FileHandler)]
+        return self.__dict__ | {"_files": files}
+
+    def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
+        """In a process that only trains, lets the first one speak."""
+        if trainer.is_global_zero and not logging.getLogger().handlers:
+            logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
+            for handler in map(logging.FileHandler, self._files):
+                logging.getLogger().addHandler(handler)
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Starts the clock."""
