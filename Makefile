@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test lint bench install
+.PHONY: train test fuzz lint bench bench-train install
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
@@ -16,8 +16,14 @@ train: install
 test: install
 	$(BIN)/pytest
 
+fuzz: install
+	$(BIN)/pytest tests/test_fuzz.py --hypothesis-profile=long
+
 bench: install
 	$(BIN)/python -m rcnn_odom.bench
+
+bench-train: install
+	$(BIN)/python -m rcnn_odom.bench_train
 
 lint: install
 	$(BIN)/ruff check

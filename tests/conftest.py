@@ -3,6 +3,7 @@
 import sys
 from pathlib import Path
 
+import hypothesis
 import pytest
 from hydra import compose, initialize_config_dir
 
@@ -10,6 +11,20 @@ from data.make_kitti import make_kitti
 
 ROOT = Path(__file__).parents[1]
 sys.path.insert(0, str(ROOT))
+
+# Damaged files are read from disk, which knows no deadline. The short mode tries the same cases every time.
+hypothesis.settings.register_profile(
+    "short",
+    max_examples=150,
+    deadline=None,
+    derandomize=True,
+    database=None,
+    suppress_health_check=[hypothesis.HealthCheck.too_slow],
+)
+hypothesis.settings.register_profile(
+    "long", hypothesis.settings.get_profile("short"), max_examples=2500, derandomize=False, print_blob=True
+)
+hypothesis.settings.load_profile("short")
 
 SMALL = [
     "data.sensor.resolution_deg=1.0",
@@ -50,3 +65,11 @@ def configure(tmp_path):
             return compose(name, [*small, *folders, *overrides])
 
     return configure
+
+
+def pytest_terminal_summary(terminalreporter):
+    """Says how much random input was tried."""
+    fuzz = sys.modules.get("test_fuzz")
+    if fuzz and fuzz.CASES:
+        each = ", ".join(f"{count} {what}" for what, count in sorted(fuzz.CASES.items()))
+        terminalreporter.write_line(f"fuzz: {sum(fuzz.CASES.values())} cases ({each})")

@@ -225,15 +225,14 @@ def test_two_processes_do_not_train_one_run(configure, kitti, command, tmp_path)
 
 def spoil_scan(monkeypatch, frame, value):
     """Lets one scan of the first training drive be bad, as a faulty laser's might be."""
-    window = Windows._window
+    write = Windows._write_window
 
-    def spoilt(self, first, *rest):
-        pairs, motions = window(self, first, *rest)
+    def spoilt(self, pairs, motions, first, *rest):
+        write(self, pairs, motions, first, *rest)
         if first <= frame <= first + self.length:
             pairs[:] = value
-        return pairs, motions
 
-    monkeypatch.setattr(Windows, "_window", spoilt)
+    monkeypatch.setattr(Windows, "_write_window", spoilt)
 
 
 def test_nan_in_the_loss_names_the_frames(configure, kitti, monkeypatch):

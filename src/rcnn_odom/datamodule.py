@@ -53,10 +53,13 @@ class Windows(Dataset):
             ``pairs`` (B, T, 2, bins) in metres, ``motions`` (B, T, 2) in metres and radians, and ``frames``
             (B,), where the windows begin, of all drives laid end to end.
         """
-        pairs, motions = zip(*(self._window(*draw) for draw in draws), strict=True)
+        pairs = np.empty((len(draws), self.length, 2, self.sensor.bins), np.float32)
+        motions = np.empty((len(draws), self.length, 2), np.float32)
+        for number, draw in enumerate(draws):
+            self._write_window(pairs[number], motions[number], *draw)
         return {
-            "pairs": torch.from_numpy(np.stack(pairs)),
-            "motions": torch.from_numpy(np.stack(motions).astype(np.float32)),
+            "pairs": torch.from_numpy(pairs),
+            "motions": torch.from_numpy(motions),
             "frames": torch.tensor([frame for frame, _, _ in draws]),
         }
 
@@ -73,22 +76,25 @@ class Windows(Dataset):
         number = int(np.searchsorted(self.first_frames, frame, side="right")) - 1
         return self.sequences[number], frame - int(self.first_frames[number])
 
-    def _window(self, frame: int, seed: int, mirror: bool) -> tuple[np.ndarray, FloatArray]:
+    def _write_window(
+        self, pairs: np.ndarray, motions: np.ndarray, frame: int, seed: int, mirror: bool
+    ) -> None:
+        """Fills in pairs (T, 2, bins) and motions (T, 2) of one window."""
         sequence, start = self._locate(frame)
         stop = start + self.length
-        pairs = np.stack([sequence.scans[start:stop], sequence.scans[start + 1 : stop + 1]], axis=1)
-        motions = sequence.motions[start:stop].copy()
+        pairs[:, 0], pairs[:, 1] = sequence.scans[start:stop], sequence.scans[start + 1 : stop + 1]
+        truth = sequence.motions[start:stop].copy()
         if self.max_turn_bins:
             turns = np.random.default_rng(seed).integers(
                 -self.max_turn_bins, self.max_turn_bins, self.length, endpoint=True
             )
             for pair, turn in zip(pairs, turns, strict=True):
                 pair[1] = turn_scan(pair[1], int(turn), self.sensor)
-            motions[:, 1] += turns * math.radians(self.sensor.resolution_deg)
+            truth[:, 1] += turns * math.radians(self.sensor.resolution_deg)
         if mirror:
-            pairs = pairs[..., ::-1]
-            motions[:, 1] *= -1
-        return pairs, motions
+            pairs[:] = pairs[..., ::-1]
+            truth[:, 1] *= -1
+        motions[:] = truth
 
 
 def turn_scan(scan: np.ndarray, bins: int, sensor: Sensor) -> np.ndarray:

@@ -17,7 +17,9 @@ def keep_freed_memory() -> None:
     if sys.platform.startswith("linux"):
         mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
         if mallopt is not None:
-            mallopt(M_MMAP_THRESHOLD, 1 << 30)
+            # Older versions take no more than half a heap of a thread.
+            if not mallopt(M_MMAP_THRESHOLD, 1 << 30):
+                mallopt(M_MMAP_THRESHOLD, 1 << 25)
             mallopt(M_TRIM_THRESHOLD, 1 << 30)
             mallopt(M_TOP_PAD, 1 << 26)
 

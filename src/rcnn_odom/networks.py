@@ -101,6 +101,10 @@ class Encoder(nn.Module):
         # first layer can take them.
         with torch.autocast(pairs.device.type, enabled=False):
             image = self.layers[0](image)
+        if torch.is_autocast_enabled(pairs.device.type):
+            # The next layer rounds anyway: before the ReLU instead of after it, the result is the same
+            # and half as many bytes pass through memory.
+            image = image.to(torch.get_autocast_dtype(pairs.device.type))
         return self.layers[1:](image).flatten(1)
 
 

@@ -44,7 +44,7 @@ def _read_lines(path: str | Path, wanted: str) -> list[str]:
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
     except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+        raise InputError(f"{path}: cannot be read: {error.strerror}; {wanted}") from error
     if not lines:
         raise InputError(f"{path}: is empty; {wanted}")
     return lines
@@ -53,17 +53,27 @@ def _read_lines(path: str | Path, wanted: str) -> list[str]:
 def _parse_row(line: str, where: str) -> FloatArray:
     fields = line.split()
     if len(fields) != 12:
-        raise InputError(f"{where}: found {len(fields)} fields where a KITTI pose has 12 numbers")
+        raise InputError(
+            f"{where}: found {len(fields)} fields where a KITTI pose has 12 numbers; correct the line"
+        )
     try:
         row = np.array([float(field) for field in fields])
     except ValueError as error:
-        raise InputError(f"{where}: not a KITTI pose of 12 numbers: {error}") from error
+        raise InputError(f"{where}: not a KITTI pose of 12 numbers ({error}); correct the line") from error
     if not np.isfinite(row).all():
-        raise InputError(f"{where}: a pose must be finite, found nan or inf")
+        raise InputError(f"{where}: a pose must be finite, found nan or inf; correct the line")
     pose = row.reshape(3, 4)
-    if abs(np.linalg.det(pose[:, :3]) - 1) > 0.01:
-        raise InputError(f"{where}: the 3x3 part of a pose must be a rotation, and this one is not")
+    if not is_rotation(pose[:, :3]):
+        raise InputError(
+            f"{where}: the 3x3 part of a pose must be a rotation, and this one is not; correct the line"
+        )
     return pose
+
+
+def is_rotation(matrix: FloatArray) -> bool:
+    """Whether a matrix (3, 3) of finite numbers turns without stretching, to a hundredth."""
+    # Large numbers first: their determinant would overflow.
+    return bool((np.abs(matrix) < 1.01).all()) and abs(np.linalg.det(matrix) - 1) < 0.01
 
 
 def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:

@@ -59,8 +59,9 @@ def parse(line: str) -> Scan:
     ranges = np.array([_number(value) for value in content["ranges"]])
     if "angle_min" not in content:
         return Scan(ranges, None, stamp)
-    steps = np.arange(len(ranges), dtype=np.float64)
-    return Scan(ranges, float(content["angle_min"]) + float(content["angle_increment"]) * steps, stamp)
+    with np.errstate(over="ignore", invalid="ignore"):  # the encoder leaves out angles that are no numbers
+        steps = float(content["angle_increment"]) * np.arange(len(ranges), dtype=np.float64)
+        return Scan(ranges, float(content["angle_min"]) + steps, stamp)
 
 
 def _number(value: Any) -> float:

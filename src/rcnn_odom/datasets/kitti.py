@@ -16,7 +16,7 @@ from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.datasets.stream import Scan, ScanStream
 from rcnn_odom.errors import InputError
 from rcnn_odom.motion import FloatArray, change_frame
-from rcnn_odom.trajectory import read_kitti
+from rcnn_odom.trajectory import is_rotation, read_kitti
 
 READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
@@ -24,6 +24,8 @@ READER_VERSION = 2
 POINT_BYTES = 16
 VELODYNE = (360.0, 0.18)
 """Degrees that a ring covers, and degrees between its beams."""
+FARTHEST = np.float32(1e6)
+"""Metres: what claims to be farther away is no return."""
 SAMPLED_FRAMES = 20
 RING_DROP = np.deg2rad(30.0)
 """The azimuth drops by more than this between rings; within one, close objects make it drop by up to 7."""
@@ -204,7 +206,7 @@ def read_calibration(path: str | Path) -> FloatArray:
         if line.startswith("Tr:"):
             tr = np.eye(4)
             tr[:3] = np.reshape(_numbers(path, number, line[3:], 12), (3, 4))
-            if abs(np.linalg.det(tr[:3, :3]) - 1) > 0.01:
+            if not is_rotation(tr[:3, :3]):
                 raise InputError(f"{path}:{number}: Tr holds no rotation; restore the original file")
             return tr
     raise InputError(f"{path}: no line starts with 'Tr:' (laser to camera); use the odometry data's own")
@@ -249,7 +251,7 @@ def _read_points(path: str | Path) -> Points:
         raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
     points = values.reshape(-1, 4)
     # A point that is not finite is how some drivers write a missing return.
-    return points[np.isfinite(points[:, :3]).all(1)]
+    return points[(np.abs(points[:, :3]) < FARTHEST).all(1)]
 
 
 def _list_scans(folder: Path) -> tuple[list[Path], str]:
