@@ -30,11 +30,12 @@ def training_set(tmp_path_factory):
 
 
 @pytest.fixture
-def make_worlds(training_set):
+def make_worlds(training_set, tmp_path):
     made = []
 
     def make_worlds(epochs=4, workers=1, **options):
-        made.append(FreshWorlds(partial(read, **options), training_set, epochs, SENSOR, workers))
+        folder = tmp_path / f"worlds{len(made)}"
+        made.append(FreshWorlds(partial(read, **options), training_set, epochs, SENSOR, workers, folder))
         return made[-1]
 
     yield make_worlds
@@ -43,9 +44,9 @@ def make_worlds(training_set):
 
 
 def test_kept_worlds_are_the_same_and_made_once(training_set, tmp_path):
-    fresh = FreshWorlds(read, training_set, 3, SENSOR, 1)
-    keeping = FreshWorlds(read, training_set, 3, SENSOR, 1, cache=tmp_path)
-    again = FreshWorlds(unreadable_scans, training_set, 3, SENSOR, 1, cache=tmp_path)
+    fresh = FreshWorlds(read, training_set, 3, SENSOR, 1, tmp_path / "passing")
+    keeping = FreshWorlds(read, training_set, 3, SENSOR, 1, tmp_path, keep=True)
+    again = FreshWorlds(unreadable_scans, training_set, 3, SENSOR, 1, tmp_path, keep=True)
     try:
         for epoch in (1, 2):
             for expected, kept in zip(fresh.of(epoch), keeping.of(epoch), strict=True):
@@ -99,8 +100,10 @@ def test_only_the_present_and_the_next_epoch_are_kept_and_none_after_the_last(ma
     kept = []
     for epoch in range(3):
         worlds.of(epoch)
-        kept.append(sorted(worlds._made))
-    assert kept == [[1], [1, 2], [2]]
+        for made in worlds._made.values():
+            made.result()
+        kept.append(sorted(path.name.split("-")[0] for path in worlds.folder.glob("*.npy")))
+    assert kept == [["00~1", "02~1"], ["00~1", "00~2", "02~1", "02~2"], ["00~2", "02~2"]]
     alone = make_worlds(epochs=1)
     alone.of(0)
     assert alone._workers is None
@@ -148,7 +151,7 @@ from rcnn_odom.fresh import FreshWorlds
 from rcnn_odom.scan import Sensor
 if __name__ == "__main__":
     drives = encode_sequences([read("00")], Sensor(), Path("cache"), 1)
-    FreshWorlds(partial(read, seconds=0.01), drives, 1000, Sensor(), 2).of(0)
+    FreshWorlds(partial(read, seconds=0.01), drives, 1000, Sensor(), 2, Path("worlds")).of(0)
     print("made", flush=True)
     time.sleep(60)
 """)
@@ -172,7 +175,7 @@ if __name__ == "__main__":
 
 
 def make_module(folder, train=NAMES, fresh_epochs=3, **options):
-    options = {"workers": 1, "fresh_epochs": fresh_epochs, **options}
+    options = {"workers": 1, "fresh_epochs": fresh_epochs, "worlds_dir": folder / "worlds", **options}
     return OdometryDataModule(read, list(train), ["10"], ["05"], SENSOR, folder, **options)
 
 
@@ -197,9 +200,10 @@ def test_batches_of_an_epoch_come_from_its_worlds(tmp_path, window):
                 assert torch.equal(one["motions"], other["motions"])
         np.testing.assert_array_equal(fresh.motion_statistics(), statistics)
         assert [drive.name for drive in fresh.sequences["train"]] == NAMES
-        assert len(list(tmp_path.glob("*.npy"))) == 4, "what is new stays in memory"
+        assert len(list(tmp_path.glob("*.npy"))) == 4
     finally:
         fresh.close()
+    assert not (tmp_path / "worlds").exists(), "what is new goes away"
 
 
 def test_part_of_a_drive_has_no_new_worlds(tmp_path):

@@ -248,7 +248,7 @@ class OdometryDataModule(L.LightningDataModule):
         fresh_epochs: of a training on new worlds in every epoch, where ``read`` makes a drive for any
             name: see :class:`rcnn_odom.fresh.FreshWorlds`. 0: every epoch sees the same drives.
         fresh_first: where the numbers of those worlds begin.
-        keep_worlds: new worlds go into the cache, for other trainings.
+        worlds_dir: of those worlds, removed after use; None: they stay in ``cache_dir``, for other trainings.
     """
 
     def __init__(
@@ -267,7 +267,7 @@ class OdometryDataModule(L.LightningDataModule):
         seed: int = 0,
         fresh_epochs: int = 0,
         fresh_first: int = 0,
-        keep_worlds: bool = False,
+        worlds_dir: str | Path | None = None,
     ) -> None:
         super().__init__()
         self.read, self.sensor, self.cache_dir = read, sensor, Path(cache_dir)
@@ -277,7 +277,7 @@ class OdometryDataModule(L.LightningDataModule):
         self.workers = workers or os.cpu_count() or 1
         self.sequences: dict[str, list[EncodedSequence]] = {}
         self.fresh_epochs, self.fresh_first = fresh_epochs, fresh_first
-        self.keep_worlds = keep_worlds
+        self.worlds_dir = worlds_dir and Path(worlds_dir)
         self.worlds: FreshWorlds | None = None
         self.windows: Windows | None = None
 
@@ -346,11 +346,15 @@ class OdometryDataModule(L.LightningDataModule):
         rank, processes = self._place()
         if self.fresh_epochs:
             self.close()
-            # Several processes meet in the cache, where one of them has put the worlds.
-            kept = self.cache_dir if self.keep_worlds or processes > 1 else None
-            workers = 0 if rank else self.workers
             self.worlds = FreshWorlds(
-                self.read, sequences, self.fresh_epochs, self.sensor, workers, self.fresh_first, kept
+                self.read,
+                sequences,
+                self.fresh_epochs,
+                self.sensor,
+                workers=0 if rank else self.workers,
+                folder=self.worlds_dir or self.cache_dir,
+                keep=self.worlds_dir is None,
+                first=self.fresh_first,
             )
             sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
         batch_size = min(self.batch_size, len(sampler) // processes * processes)

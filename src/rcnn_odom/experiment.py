@@ -53,7 +53,7 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
         fresh_epochs=model["epochs"] if data.get("fresh_worlds") else 0,
         # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
         fresh_first=model["first_stage"]["epochs"] if "first_stage" in model else 0,
-        keep_worlds=data.get("keep_worlds", False),
+        worlds_dir=None if data.get("keep_worlds") else Path(settings["run_dir"]) / "worlds",
         **data["augment"],
     )
 
