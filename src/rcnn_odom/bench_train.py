@@ -142,10 +142,14 @@ def _unfuse_adam() -> None:
 
 
 def _plain_layout() -> None:
-    def forward(self: networks.Encoder, pairs: Tensor) -> Tensor:
-        return self.layers(pairs.unsqueeze(2)).flatten(1)
+    made = networks.Encoder.__init__
 
-    networks.Encoder.forward = forward  # type: ignore[method-assign]
+    def build(self: networks.Encoder, *arguments: Any) -> None:
+        made(self, *arguments)
+        self.layers.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
+
+    networks.Encoder.__init__ = build  # type: ignore[method-assign]
+    networks.Encoder.lay_out = lambda self, pairs: pairs.unsqueeze(2)  # type: ignore
 
 
 class _TorchLSTM(nn.Module):

@@ -95,8 +95,7 @@ class Encoder(nn.Module):
 
     def forward(self, pairs: Tensor) -> Tensor:
         """Features (B, features) of pairs (B, 2, bins), earlier scan first, ranges within 0..1."""
-        # Stored with the two scans innermost, this is the channels-last layout already.
-        image = pairs.transpose(1, 2).contiguous().transpose(1, 2).unsqueeze(2)
+        image = self.lay_out(pairs)
         # The motion shows in small differences between two scans: bf16 would round them away before the
         # first layer can take them.
         with torch.autocast(pairs.device.type, enabled=False):
@@ -106,6 +105,10 @@ class Encoder(nn.Module):
             # and half as many bytes pass through memory.
             image = image.to(torch.get_autocast_dtype(pairs.device.type))
         return self.layers[1:](image).flatten(1)
+
+    def lay_out(self, pairs: Tensor) -> Tensor:
+        """Images (B, 2, 1, bins) whose two scans are innermost in memory: the channels-last layout."""
+        return pairs.transpose(1, 2).contiguous().transpose(1, 2).unsqueeze(2)
 
 
 class MotionHead(nn.Module):
