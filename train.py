@@ -7,7 +7,6 @@ from functools import partial
 import hydra
 from omegaconf import DictConfig
 
-import rcnn_odom.run_folder  # noqa: F401  for conf/config.yaml
 from rcnn_odom.job import in_sweep, run_command, run_job
 
 log = logging.getLogger("rcnn_odom")

@@ -95,7 +95,12 @@ def test_a_batch_must_come_out_even(configure, uneven):
         train(configure("model=cnn_reg", *uneven, "trainer=ddp", "model.batch_size=7"))
 
 
-@pytest.mark.parametrize("start", [0, 3])
+def test_more_devices_than_windows_are_refused(configure, kitti):
+    with pytest.raises(InputError, match="have 1 windows of 32 pairs, fewer than the 2 devices"):
+        train(configure("model=rcnn_reg", *kitti, "trainer=ddp", "model.window=32"))
+
+
+@pytest.mark.parametrize("start", [0, 2])
 def test_processes_share_every_batch(start):
     def batches(*place):
         sampler = WindowSampler([40, 30], 4, False, seed=1)

@@ -11,6 +11,7 @@ from multiprocessing import get_context
 from pathlib import Path
 
 import pytest
+import torch
 import yaml
 
 from conftest import ROOT
@@ -164,11 +165,19 @@ def test_a_moved_sweep_is_known_again(sweep, tmp_path):
     assert "is finished already" in printed
 
 
-def test_sampling_sweepers_are_refused_on_several_devices(sweep):
+def test_sampling_sweepers_draw_once_for_all_processes(sweep, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="the extra 'sweeps' is not installed")
-    printed = sweep("+sweeps=optuna", "trainer.devices=2", "hydra.sweeper.n_trials=1", status=1)
-    assert "trainer.devices=2: every process of a run would draw other values from this sweeper" in printed
-    assert "Traceback" not in printed
+    small = [
+        "model.hidden_size=16",
+        "model.epochs=1",
+        "model.first_stage.epochs=1",
+        "hydra.sweeper.n_trials=1",
+    ]
+    sweep("+sweeps=optuna", *small, "trainer=ddp")
+    [run] = runs_of(tmp_path / "optuna")
+    drawn = yaml.safe_load((run / "config.yaml").read_text())["model"]["beta"]
+    used = torch.load(run / BEST, weights_only=True)["hyper_parameters"]["model"]["beta"]
+    assert used == drawn
 
 
 def test_optuna_minimises_validation_drift_and_goes_on(sweep, tmp_path):

@@ -148,7 +148,7 @@ def _plain_layout() -> None:
         made(self, *arguments)
         self.layers.to(memory_format=torch.contiguous_format)  # type: ignore[call-overload]
 
-    networks.Encoder.__init__ = build  # type: ignore[method-assign]
+    networks.Encoder.__init__ = build  # type: ignore
     networks.Encoder.lay_out = lambda self, pairs: pairs.unsqueeze(2)  # type: ignore
 
 

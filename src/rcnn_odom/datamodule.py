@@ -357,12 +357,11 @@ class OdometryDataModule(L.LightningDataModule):
                 first=self.fresh_first,
             )
             sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
-        batch_size = min(self.batch_size, len(sampler) // processes * processes)
         # A batch is gathered in one call, so there is nothing to collate; worker processes would only
         # copy what a memory map gives for nothing.
         return TrainingLoader(
             windows,
-            batch_sampler=Batches(sampler, batch_size, rank, processes),  # type: ignore[arg-type]
+            batch_sampler=Batches(sampler, self._windows_in_batch(), rank, processes),  # type: ignore[arg-type]
             collate_fn=_as_is,
         )
 
@@ -373,9 +372,17 @@ class OdometryDataModule(L.LightningDataModule):
     @property
     def batches_per_epoch(self) -> int:
         """Steps that an epoch takes."""
-        _, processes = self._place()
-        windows = len(self._sampler())
-        return windows // min(self.batch_size, windows // processes * processes)
+        return len(self._sampler()) // self._windows_in_batch()
+
+    def _windows_in_batch(self) -> int:
+        """Of all processes together: as many as wanted, or as many as there are, shared evenly."""
+        windows, (_, processes) = len(self._sampler()), self._place()
+        if windows < processes:
+            raise InputError(
+                f"the training drives have {windows} windows of {self.window} pairs, fewer than the "
+                f"{processes} devices; set model.window or trainer.devices lower"
+            )
+        return min(self.batch_size, windows // processes * processes)
 
     def _place(self) -> tuple[int, int]:
         """Number of this process among those that train, and how many these are."""

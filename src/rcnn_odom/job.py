@@ -15,8 +15,8 @@ from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
+from rcnn_odom import run_folder, sweep  # noqa: F401  resolvers of conf/config.yaml
 from rcnn_odom.errors import InputError
-from rcnn_odom.sweep import draws_its_jobs
 
 log = logging.getLogger(__name__)
 
@@ -45,7 +45,7 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
     try:
         if in_sweep():
-            _check_sweep(cfg)
+            _check_sweep()
             (folder / ERROR).unlink(missing_ok=True)
         elif "sweeps" in HydraConfig.get().runtime.choices:
             raise InputError("+sweeps= needs -m: one run would take nothing from a sweep")
@@ -66,16 +66,10 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
         raise
 
 
-def _check_sweep(cfg: DictConfig) -> None:
+def _check_sweep() -> None:
     hydra = HydraConfig.get()
     if any(override.split("=")[0] == "run_dir" for override in hydra.overrides.task):
         raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
-    devices = cfg.trainer.devices
-    if draws_its_jobs(hydra.sweeper._target_) and devices != 1:
-        raise InputError(
-            f"trainer.devices={devices}: every process of a run would draw other values from this sweeper; "
-            "set trainer.devices=1"
-        )
 
 
 def _leave_error(folder: Path, error: Exception) -> None:

@@ -1,5 +1,6 @@
 """Training in several processes that Lightning starts: their errors and signals, as if there were one."""
 
+import logging
 import multiprocessing
 import signal
 from collections.abc import Iterator
@@ -10,6 +11,9 @@ from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.saving import SIGNALS, Stopped
+
+# It warns of every process that it ends because another one has failed.
+logging.getLogger("torch.multiprocessing").setLevel(logging.ERROR)
 
 
 @contextmanager
