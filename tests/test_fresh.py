@@ -210,3 +210,50 @@ def test_part_of_a_drive_has_no_new_worlds(tmp_path):
     with pytest.raises(InputError, match=r"data.train=00\[:0.5\]: new worlds come as whole drives"):
         make_module(tmp_path, train=["00[:0.5]"]).load()
     assert len(make_module(tmp_path, train=["00[:0.5]"], fresh_epochs=0).load().sequences["train"][0]) == 75
+
+
+MEMORY = """
+import sys
+from pathlib import Path
+from rcnn_odom.cache import encode_sequences
+from rcnn_odom.datamodule import OdometryDataModule
+from rcnn_odom.scan import Sensor
+from stub_drives import read
+import stub_drives
+if __name__ == "__main__":
+    names = [f"{number:03d}" for number in range(int(sys.argv[1]))]
+    stub_drives.FRAMES |= dict.fromkeys(names, 150)
+    folder = Path(sys.argv[2])
+    data = OdometryDataModule(read, names, ["10"], ["05"], Sensor(), folder, workers=1, fresh_epochs=3,
+                              worlds_dir=folder / "worlds").load()
+    loader = data.train_dataloader()
+    for epoch in range(3):
+        loader.batch_sampler.sampler.set_epoch(epoch)
+        for batch in loader:
+            pass
+    status = Path("/proc/self/status").read_text()
+    print(next(int(line.split()[1]) for line in status.splitlines() if line.startswith("RssAnon")))
+    data.close()
+"""
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the memory from /proc")
+def test_memory_does_not_grow_with_the_drives(tmp_path):
+    script = tmp_path / "memory.py"
+    # Workers import the drives anew, so the number of frames has to be found by every name.
+    script.write_text(MEMORY)
+    environment = {"PYTHONPATH": ":".join(sys.path), "OMP_NUM_THREADS": "1"}
+    used = [
+        int(
+            subprocess.run(
+                [sys.executable, str(script), str(drives), str(tmp_path / str(drives))],
+                env=environment,
+                stdout=subprocess.PIPE,
+                check=True,
+                timeout=120,
+            ).stdout
+        )
+        for drives in (4, 44)
+    ]
+    # In memory, 40 drives of 150 scans of 14 kB would be 86 MB, and as much again for the next epoch.
+    assert used[1] - used[0] < 15_000, used

@@ -167,14 +167,9 @@ def test_a_moved_sweep_is_known_again(sweep, tmp_path):
 
 def test_sampling_sweepers_draw_once_for_all_processes(sweep, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="the extra 'sweeps' is not installed")
-    small = [
-        "model.hidden_size=16",
-        "model.epochs=1",
-        "model.first_stage.epochs=1",
-        "hydra.sweeper.n_trials=1",
-    ]
-    sweep("+sweeps=optuna", *small, "trainer=ddp")
-    [run] = runs_of(tmp_path / "optuna")
+    small = ["model=cnn_reg", "model.epochs=1", "trainer=ddp", f"hydra.sweep.dir={tmp_path}/drawn"]
+    sweep("hydra/sweeper=optuna", "hydra.sweeper.n_trials=1", "model.beta=interval(1,100)", *small)
+    [run] = runs_of(tmp_path / "drawn")
     drawn = yaml.safe_load((run / "config.yaml").read_text())["model"]["beta"]
     used = torch.load(run / BEST, weights_only=True)["hyper_parameters"]["model"]["beta"]
     assert used == drawn
