@@ -214,20 +214,20 @@ def test_part_of_a_drive_has_no_new_worlds(tmp_path):
 
 MEMORY = """
 import sys
+from functools import partial
 from pathlib import Path
 from rcnn_odom.cache import encode_sequences
 from rcnn_odom.datamodule import OdometryDataModule
 from rcnn_odom.scan import Sensor
 from stub_drives import read
-import stub_drives
 if __name__ == "__main__":
     names = [f"{number:03d}" for number in range(int(sys.argv[1]))]
-    stub_drives.FRAMES |= dict.fromkeys(names, 150)
     folder = Path(sys.argv[2])
-    data = OdometryDataModule(read, names, ["10"], ["05"], Sensor(), folder, workers=1, fresh_epochs=3,
-                              worlds_dir=folder / "worlds").load()
+    options = {"workers": 1, "fresh_epochs": 2, "worlds_dir": folder / "worlds"}
+    drives = partial(read, frames=150)
+    data = OdometryDataModule(drives, names, ["10"], ["05"], Sensor(), folder, **options).load()
     loader = data.train_dataloader()
-    for epoch in range(3):
+    for epoch in range(2):
         loader.batch_sampler.sampler.set_epoch(epoch)
         for batch in loader:
             pass
@@ -240,7 +240,6 @@ if __name__ == "__main__":
 @pytest.mark.skipif(not sys.platform.startswith("linux"), reason="reads the memory from /proc")
 def test_memory_does_not_grow_with_the_drives(tmp_path):
     script = tmp_path / "memory.py"
-    # Workers import the drives anew, so the number of frames has to be found by every name.
     script.write_text(MEMORY)
     environment = {"PYTHONPATH": ":".join(sys.path), "OMP_NUM_THREADS": "1"}
     used = [
@@ -253,7 +252,7 @@ def test_memory_does_not_grow_with_the_drives(tmp_path):
                 timeout=120,
             ).stdout
         )
-        for drives in (4, 44)
+        for drives in (4, 24)
     ]
-    # In memory, 40 drives of 150 scans of 14 kB would be 86 MB, and as much again for the next epoch.
+    # In memory, 20 drives of 150 scans of 14 kB would be 43 MB.
     assert used[1] - used[0] < 15_000, used
