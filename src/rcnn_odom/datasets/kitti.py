@@ -250,6 +250,8 @@ def _read_points(path: str | Path) -> Points:
     if len(values) == 0 or len(values) % 4:
         raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
     points = values.reshape(-1, 4)
+    if values.max() < FARTHEST and values.min() > -FARTHEST:
+        return points  # the usual file, seen in a tenth of the time
     # A point that is not finite is how some drivers write a missing return.
     return points[(np.abs(points[:, :3]) < FARTHEST).all(1)]
 
