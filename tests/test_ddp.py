@@ -77,7 +77,8 @@ def test_two_processes_score_as_one_and_log_once(configure, uneven, tmp_path, ca
 
 
 def test_new_worlds_are_made_once_and_shared(configure, tmp_path, capfd):
-    train(configure("model=cnn_reg", *STUB, "data.fresh_worlds=true", "trainer=ddp"))
+    options = ["data.fresh_worlds=true", "data.keep_worlds=true", "trainer=ddp"]
+    train(configure("model=cnn_reg", *STUB, *options))
     assert capfd.readouterr().out.count("new worlds for every epoch") == 1
     names = sorted(path.name.split("-")[0] for path in (tmp_path / "outputs" / "cache").glob("*.npy"))
     assert names == ["00", "00~1", "02", "02~1", "05", "10"]
