@@ -54,7 +54,8 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     except SystemExit:  # how Lightning ends after Ctrl-C
         raise KeyboardInterrupt from None
     except (InputError, OSError) as error:
-        log.error("error: %s", error)
+        full = "; make room, and the same command goes on" if isinstance(error, OSError) else ""
+        log.error("error: %s%s", error, full)
         _failed.append(error)
         if in_sweep():
             _leave_error(folder, error)
@@ -82,6 +83,7 @@ def run_command(main: Callable[[], object]) -> int:
     # Hydra would print and exit by itself, also where a folder cannot be made.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
+    logging.raiseExceptions = False  # a log on a full disk would otherwise print a traceback for every line
     try:
         main()
     except KeyboardInterrupt:
