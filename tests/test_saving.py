@@ -73,8 +73,8 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
         options += [f"model.pretrained={tmp_path}/outputs/cnn/{BEST}", "model.batch_size=2"]
     train(configure(*options, run="whole"))
     whole = result_of(tmp_path / "outputs" / "whole")
-    steps = 2 * (7 if variant == "cnn_cls" else 3)
-    for step in range(1, steps + 1):
+    epoch = 7 if variant == "cnn_cls" else 3
+    for step in range(1, 2 * epoch + 1):
         run = f"killed_{step}"
         with monkeypatch.context() as patch:
             batch_end = saving.Saving.on_train_batch_end
@@ -89,7 +89,9 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
                 train(configure(*options, run=run))
         with caplog.at_level("INFO"):
             train(configure(*options, run=run))
-        assert f"going on from {tmp_path}/outputs/{run}/{LAST}, step {step}" in caplog.text
+        # The validation belongs to the epoch's last step, after which nothing is saved before it.
+        saved = step - 1 if step % epoch == 0 else step
+        assert f"going on from {tmp_path}/outputs/{run}/{LAST}, step {saved}\n" in caplog.text
         assert_same(result_of(tmp_path / "outputs" / run), whole)
 
 
