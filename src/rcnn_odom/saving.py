@@ -1,6 +1,5 @@
 """What keeps a training safe: checkpoints that are whole or not there, saved often and before it stops."""
 
-import logging
 import multiprocessing
 import os
 import signal
@@ -17,12 +16,11 @@ from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.errors import InputError
 
-log = logging.getLogger(__name__)
-
 EVERY = 60.0
 """Seconds between checkpoints within an epoch; saving the largest network takes less than one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
 NOTHING, SAVE, STOP = 0, 1, 2
+STDERR = 2
 
 
 def starter_lives() -> bool:
@@ -99,7 +97,8 @@ class Saving(Callback):
         if self._asked or not self._within_epoch:
             raise KeyboardInterrupt
         self._asked = True
-        log.info("stopping as soon as this step or validation is done and saved")
+        # Not by logging, in the middle of which the signal may have come.
+        os.write(STDERR, b"stopping as soon as this step or validation is done and saved\n")
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
