@@ -1,5 +1,6 @@
 """A training that is stopped, killed or runs out of disk goes on to the very same result, or says why not."""
 
+import hashlib
 import json
 import os
 import pickle
@@ -76,23 +77,49 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
     epoch = 7 if variant == "cnn_cls" else 3
     for step in range(1, 2 * epoch + 1):
         run = f"killed_{step}"
-        with monkeypatch.context() as patch:
-            batch_end = saving.Saving.on_train_batch_end
-
-            def die(self, trainer, *arguments, batch_end=batch_end, step=step):
-                batch_end(self, trainer, *arguments)
-                if trainer.global_step == step:
-                    raise Killed
-
-            patch.setattr(saving.Saving, "on_train_batch_end", die)
-            with pytest.raises(Killed):
-                train(configure(*options, run=run))
+        kill_after(monkeypatch, step, lambda run=run: train(configure(*options, run=run)))
         with caplog.at_level("INFO"):
             train(configure(*options, run=run))
         # The validation belongs to the epoch's last step, after which nothing is saved before it.
         saved = step - 1 if step % epoch == 0 else step
         assert f"going on from {tmp_path}/outputs/{run}/{LAST}, step {saved}\n" in caplog.text
         assert_same(result_of(tmp_path / "outputs" / run), whole)
+
+
+def kill_after(monkeypatch, step, train_it):
+    """Runs a training that dies after a step."""
+    batch_end = saving.Saving.on_train_batch_end
+
+    def die(self, trainer, *arguments):
+        batch_end(self, trainer, *arguments)
+        if trainer.global_step == step:
+            raise Killed
+
+    with monkeypatch.context() as patch:
+        patch.setattr(saving.Saving, "on_train_batch_end", die)
+        with pytest.raises(Killed):
+            train_it()
+
+
+def test_a_run_whose_folder_was_moved_goes_on_bit_for_bit(
+    configure, kitti, tmp_path, monkeypatch, save_at_every_step
+):
+    options = ["model=cnn_reg", *kitti]
+    train(configure(*options, run="whole"))
+    kill_after(monkeypatch, 10, lambda: train(configure(*options, run="here")))
+    (tmp_path / "outputs" / "here").rename(tmp_path / "outputs" / "there")
+    train(configure(*options, run="there"))
+    assert_same(*(result_of(tmp_path / "outputs" / run) for run in ("there", "whole")))
+
+
+def test_killed_before_the_first_checkpoint_it_begins_again_with_clean_curves(
+    configure, kitti, tmp_path, monkeypatch
+):
+    options = ["model=cnn_reg", *kitti, "model.batch_size=4"]
+    train(configure(*options, run="whole"))
+    kill_after(monkeypatch, 12, lambda: train(configure(*options)))
+    train(configure(*options))
+    assert_same(*(result_of(tmp_path / "outputs" / run) for run in ("run", "whole")))
 
 
 # As `python train.py`, but it saves four times a second, so that kills also fall between epochs' ends.
@@ -321,6 +348,7 @@ def test_malicious_files_run_nothing(configure, kitti, tmp_path):
             evaluate(configure(f"run={outputs}/cnn", name="evaluate", run="c"))
     for scans in (outputs / "cache").glob("*.npy"):
         np.save(scans, np.array([malice], dtype=object), allow_pickle=True)
+        scans.write_bytes(scans.read_bytes() + hashlib.sha256(scans.read_bytes()).digest())
     train(configure("model=cnn_reg", *kitti, run="d"))
     config = outputs / "cnn" / "config.yaml"
     config.write_text(f"data: !!python/object/apply:os.system ['touch {proof}']\nmodel: 1\ntrainer: 1\n")

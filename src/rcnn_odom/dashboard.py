@@ -58,10 +58,9 @@ class Layout(Callback):
         assert isinstance(trainer.logger, TensorBoardLogger)
         writer = trainer.logger.experiment
         writer.add_custom_scalars(LAYOUT)
-        if trainer.global_step:
-            # A run that goes on will log what came after its checkpoint once more.
-            start = SessionLog(status=SessionLog.START)
-            writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
+        # A run that goes on, or begins again, will log what came after its last checkpoint once more.
+        start = SessionLog(status=SessionLog.START)
+        writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
 
 
 def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, Any], step: int) -> None:

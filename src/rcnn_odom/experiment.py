@@ -9,7 +9,6 @@ from tempfile import TemporaryDirectory
 
 import lightning as L
 from hydra.utils import instantiate
-from lightning.pytorch.callbacks import ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
@@ -26,7 +25,7 @@ from rcnn_odom.modules import VARIANTS, CNNClassification, OdometryModule, Recur
 from rcnn_odom.processes import one_line_errors
 from rcnn_odom.report import Estimates, report_test
 from rcnn_odom.runs import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
-from rcnn_odom.saving import AtomicCheckpointIO, Saving
+from rcnn_odom.saving import AtomicCheckpointIO, Best, Saving
 from rcnn_odom.scan import Sensor
 from rcnn_odom.settings import Settings
 from rcnn_odom.training_log import TrainingLog
@@ -111,17 +110,9 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
 
 
 def _training_options(settings: Settings, run: Path) -> Settings:
-    best = ModelCheckpoint(
-        (run / BEST).parent,
-        "best",
-        monitor="val/drift",
-        save_weights_only=True,
-        enable_version_counter=False,
-        save_on_train_epoch_end=False,
-    )
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [Layout(), TrainingLog(), best, Saving(run / LAST)],
+        "callbacks": [Layout(), TrainingLog(), Best(run / BEST), Saving(run / LAST)],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
     }
@@ -191,12 +182,13 @@ def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer,
                 "choose another run_dir, or remove it to begin again"
             )
         log.info("going on from %s, step %d", last, saved["global_step"])
+        del saved  # its maps would keep the file's place on the disk
     with one_line_errors(trainer):
         trainer.fit(
             module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
         )
     saved = read_checkpoint(last)  # where training in other processes has left it too
-    (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("ModelCheckpoint"))
+    (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("Best"))
     drift = best["best_model_score"]
     return {
         **metrics,

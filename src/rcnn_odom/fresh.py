@@ -5,6 +5,7 @@ import shutil
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
+from threading import Event
 
 from rcnn_odom.cache import Encoded, EncodedSequence, Encoding, OpenDrive, cache_path, encode_sequences
 from rcnn_odom.scan import Sensor
@@ -56,6 +57,7 @@ class FreshWorlds:
         # One thread: the workers make one epoch after the other.
         self._maker = ThreadPoolExecutor(1)
         self._made: dict[int, Future[list[EncodedSequence]]] = {}
+        self._closed = Event()
 
     def of(self, epoch: int) -> list[EncodedSequence]:
         """The drives of an epoch, waiting for them if need be; those of the next are begun.
@@ -85,9 +87,11 @@ class FreshWorlds:
         return all(cache_path(world, self.sensor, self.folder).exists() for world in worlds)
 
     def _make(self, epoch: int) -> list[EncodedSequence]:
-        while not (self.worker_count or self._has_all([epoch])):
-            time.sleep(POLLING)
         worlds = [self.read(name) for name in self._names(epoch)]
+        paths = [cache_path(world, self.sensor, self.folder) for world in worlds]
+        while not (self.worker_count or all(path.exists() for path in paths)):
+            if self._closed.wait(POLLING):
+                return []
         return encode_sequences(worlds, self.sensor, self.folder, max(1, self.worker_count), self._workers)
 
     def _forget(self, made: "Future[list[EncodedSequence]]") -> None:
@@ -98,6 +102,7 @@ class FreshWorlds:
 
     def close(self) -> None:
         """Ends the workers at once and forgets their worlds."""
+        self._closed.set()
         if self._workers is not None:
             self._workers.close()
         self._maker.shutdown(cancel_futures=True)

@@ -1,5 +1,6 @@
 """What stands around a Hydra job: its folder, and mistakes of the user as one line and an exit status."""
 
+import errno
 import logging
 import os
 import re
@@ -54,7 +55,8 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     except SystemExit:  # how Lightning ends after Ctrl-C
         raise KeyboardInterrupt from None
     except (InputError, OSError) as error:
-        full = "; make room, and the same command goes on" if isinstance(error, OSError) else ""
+        is_full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        full = "; make room, and the same command goes on" if is_full else ""
         log.error("error: %s%s", error, full)
         _failed.append(error)
         if in_sweep():

@@ -24,7 +24,7 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
         InputError: one of them met a mistake of the user, or was killed.
         Stopped: they were asked to stop, and have saved.
     """
-    with _signals_passed_on(trainer):
+    with _signals_passed_on(trainer) as asked:
         try:
             yield
         except ProcessRaisedException as error:
@@ -32,10 +32,12 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
                 kind, _, message = line.partition(":")
                 if kind == f"{InputError.__module__}.{InputError.__name__}":
                     raise InputError(message.strip()) from error
-                if kind == f"{Stopped.__module__}.{Stopped.__name__}":
+                if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
                     raise Stopped from error
             raise
         except ProcessExitedException as error:
+            if asked:
+                raise Stopped from error
             raise InputError(
                 "a training process was killed, perhaps for want of memory; the same command goes on from "
                 "the last checkpoint"
@@ -43,25 +45,28 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
 
 
 @contextmanager
-def _signals_passed_on(trainer: L.Trainer) -> Iterator[None]:
-    """Lets the processes that train save and stop, instead of ending the one that waits for them."""
+def _signals_passed_on(trainer: L.Trainer) -> Iterator[list[int]]:
+    """Lets the processes that train save and stop, instead of ending the one that waits for them.
+
+    Yields:
+        The signals that have come.
+    """
+    asked: list[int] = []
     if trainer.world_size == 1:
-        yield
+        yield asked
         return
-    asked = False
 
     def pass_on(number: int, frame: object) -> None:
-        nonlocal asked
         processes = multiprocessing.active_children()
         if asked or not processes:
             raise KeyboardInterrupt
-        asked = True
+        asked.append(number)
         for process in processes:
             process.terminate()
 
     before = {number: signal.signal(number, pass_on) for number in SIGNALS}
     try:
-        yield
+        yield asked
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

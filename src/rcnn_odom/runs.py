@@ -126,6 +126,8 @@ def read_settings(run: Path) -> Settings:
 
 def fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
     """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
+    from rcnn_odom.machine import resolve_precision  # with torch, which would make --help slow
+
     recordings = {
         split: [
             (sequence.key, sequence.name, hashlib.sha256(np.round(sequence.poses, 6).tobytes()).hexdigest())
@@ -136,7 +138,10 @@ def fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
     if settings["data"].get("fresh_worlds"):  # drives that are not among the recordings yet
         data["fresh_worlds"] = settings["data"]["reader"]
-    parts = [RECIPE_VERSION, recordings, data, settings["model"], settings["trainer"], settings["seed"]]
+    trainer = settings["trainer"]
+    precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
+    parts = [RECIPE_VERSION, recordings, data, settings["model"], trainer | {"precision": precision}]
+    parts.append(settings["seed"])
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
@@ -160,5 +165,8 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 
 def _write(path: Path, text: str) -> None:
     partial = path.with_name(f".{path.name}.partial")
-    partial.write_text(text)
+    with partial.open("w") as file:
+        file.write(text)
+        file.flush()
+        os.fsync(file.fileno())
     partial.replace(path)

@@ -5,13 +5,14 @@ import os
 import signal
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import lightning as L
 import torch
 from lightning.fabric.plugins.io import TorchCheckpointIO
-from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.errors import InputError
@@ -66,6 +67,32 @@ class AtomicCheckpointIO(TorchCheckpointIO):
         save_atomically(checkpoint, Path(path))
 
 
+class Best(ModelCheckpoint):
+    """The weights with the best validation drift.
+
+    Args:
+        path: of their checkpoint.
+    """
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(
+            path.parent,
+            path.stem,
+            monitor="val/drift",
+            save_weights_only=True,
+            enable_version_counter=False,
+            save_on_train_epoch_end=False,
+        )
+
+    def load_state_dict(self, state_dict: dict[str, Any]) -> None:
+        """Goes on from a checkpoint's, wherever the run's folder now is; Lightning would forget the score."""
+        before, now = str(state_dict["dirpath"]), str(self.dirpath)
+        paths = ("best_model_path", "kth_best_model_path", "last_model_path")
+        moved = {name: str(state_dict[name]).replace(before, now, 1) for name in paths}
+        models = {path.replace(before, now, 1): score for path, score in state_dict["best_k_models"].items()}
+        super().load_state_dict(state_dict | moved | {"dirpath": self.dirpath, "best_k_models": models})
+
+
 class Saving(Callback):
     """Saves everything that a training needs to go on bit for bit, and stops it when it is asked to.
 
@@ -98,7 +125,8 @@ class Saving(Callback):
             raise KeyboardInterrupt
         self._asked = True
         # Not by logging, in the middle of which the signal may have come.
-        os.write(STDERR, b"stopping as soon as this step or validation is done and saved\n")
+        with suppress(OSError):  # nobody may be there to read it
+            os.write(STDERR, b"stopping as soon as this step or validation is done and saved\n")
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
