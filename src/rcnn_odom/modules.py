@@ -99,6 +99,15 @@ class OdometryModule(L.LightningModule):
         """Lightning's hook, in every process that trains or tests."""
         keep_freed_memory()
 
+    def teardown(self, stage: str) -> None:
+        """Lightning's hook at the end, in every process: lets go of the others.
+
+        A process that ends while it still holds the connection sometimes aborts.
+        """
+        if self.trainer.world_size > 1 and torch.distributed.is_initialized():
+            torch.distributed.barrier()
+            torch.distributed.destroy_process_group()
+
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
         """Makes dropout a function of the step, so that a training that goes on draws what it would have."""
         drawn_from = [self._data.seed, self.global_step, self.global_rank]
