@@ -43,8 +43,8 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     try:
         trainer = experiment.build_trainer(settings, run)
         datamodule = experiment.build_datamodule(settings)
-        runs.start_run(run, settings)
         with runs.claimed(run):
+            runs.start_run(run, settings)
             datamodule.load()
             runs.point_latest(outputs, run)
             fingerprint = runs.fingerprint(settings, datamodule)

@@ -308,7 +308,7 @@ def test_bad_weights_are_not_saved(configure, kitti, tmp_path, monkeypatch, save
                 list(module.parameters())[-1].fill_(float("nan"))
 
     monkeypatch.setattr(TrainingLog, "on_train_batch_end", spoil)
-    with pytest.raises(InputError, match="step 5: a weight is nan or inf"):
+    with pytest.raises(InputError, match="step 4: a weight is nan or inf"):
         train(configure("model=cnn_reg", *kitti))
     assert torch.load(tmp_path / "outputs" / "run" / LAST, weights_only=True)["global_step"] == 3
 

@@ -4,7 +4,7 @@ import logging
 import math
 import os
 import re
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from itertools import islice
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from typing import Any
 import lightning as L
 import numpy as np
 import torch
-from torch.utils.data import DataLoader, Dataset, DistributedSampler, Sampler
+from torch.utils.data import BatchSampler, DataLoader, Dataset, DistributedSampler, Sampler
 
 from rcnn_odom.cache import EncodedSequence, encode_sequences
 from rcnn_odom.datasets.sequence import Sequence
@@ -190,17 +190,10 @@ class Batches(Sampler[list[Draw]]):
 
     def __iter__(self) -> Iterator[list[Draw]]:
         self.given, self._skipped = self._skipped, 0
-        batches = batched(self.sampler, self.batch_size)
-        for batch in islice(batches, self.given, len(self)):
+        whole: Any = BatchSampler(self.sampler, self.batch_size, drop_last=True)  # type: ignore[arg-type]
+        for batch in islice(whole, self.given, None):
             self.given += 1
             yield batch[self.rank :: self.processes]
-
-
-def batched(draws: Iterable[Draw], size: int) -> Iterator[list[Draw]]:
-    """Lists of as many draws; the last may be shorter."""
-    rest = iter(draws)
-    while batch := list(islice(rest, size)):
-        yield batch
 
 
 class TrainingLoader(DataLoader):

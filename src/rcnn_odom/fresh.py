@@ -50,7 +50,7 @@ class FreshWorlds:
     ) -> None:
         self.read, self.drives, self.epochs, self.sensor, self.first = read, drives, epochs, sensor, first
         self.folder, self.keep = folder, keep
-        self.worker_count = useful_workers(workers, sum(map(len, drives))) if workers else 0
+        self.worker_count = useful_workers(workers, sum(map(len, drives)))
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
         self._workers: Workers[Encoded] | None = None

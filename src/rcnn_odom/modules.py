@@ -135,7 +135,7 @@ class OdometryModule(L.LightningModule):
             finite = estimate.motion.isfinite().all(-1).all(-1)
             # One bad window spoils the mean of all: the estimates tell which it is.
             self._trained_on = batch["frames"] if finite.all() else batch["frames"][~finite]
-            raise self._diverged("the loss is nan or inf")
+            raise self._diverged("the loss is nan or inf", self.global_step + 1)
         parts = {"loss_distance": loss.distance, "loss_rotation": loss.rotation}
         return {"loss": loss.total, **parts, **outside}
 
@@ -155,7 +155,7 @@ class OdometryModule(L.LightningModule):
         """
         norm = torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val or float("inf"))
         if not norm.isfinite():
-            raise self._diverged("the gradient is nan or inf")
+            raise self._diverged("the gradient is nan or inf", self.global_step + 1)
 
     def check_weights(self) -> None:
         """Looks for nan and inf before the weights are kept.
@@ -164,14 +164,14 @@ class OdometryModule(L.LightningModule):
             InputError: there are some.
         """
         if not all(parameter.isfinite().all() for parameter in self.parameters()):
-            raise self._diverged("a weight is nan or inf")
+            raise self._diverged("a weight is nan or inf", self.global_step)
 
-    def _diverged(self, what: str) -> InputError:
+    def _diverged(self, what: str, step: int) -> InputError:
         windows = self._data.windows
         frames = windows.describe(self._trained_on.tolist()) if windows else "unknown"
         return InputError(
-            f"training diverged in epoch {self.current_epoch + 1}, step {self.global_step + 1}: {what}, "
-            f"after frames {frames}; look at these, or set model.learning_rate lower"
+            f"training diverged in epoch {self.current_epoch + 1}, step {step}: {what}, after "
+            f"frames {frames}; look at these, or set model.learning_rate lower"
         )
 
     @property
@@ -209,11 +209,16 @@ class OdometryModule(L.LightningModule):
         """
         estimate = self.estimate(batch["scans"])
         if not np.isfinite(estimate.motions).all():
-            raise self._diverged("validation is estimated as nan or inf")
+            raise self._diverged("validation is estimated as nan or inf", self.global_step)
         self.estimates[batch["number"]] = estimate
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the drift of each validation sequence and their mean, and the mean errors of a frame."""
+        """Logs the drift of each validation sequence and their mean, and the mean errors of a frame.
+
+        Raises:
+            InputError: a weight is nan or inf, behind a ReLU that hides it; it must not become the best.
+        """
+        self.check_weights()
         self._gather_estimates()
         sequences = self._data.sequences["val"]
         names = [sequence.name for sequence in sequences]

@@ -32,6 +32,8 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
                 kind, _, message = line.partition(":")
                 if kind == f"{InputError.__module__}.{InputError.__name__}":
                     raise InputError(message.strip()) from error
+                if kind == OSError.__name__:
+                    raise InputError(f"{message.strip()}; make room, and the same command goes on") from error
                 if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
                     raise Stopped from error
             raise

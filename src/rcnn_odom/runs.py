@@ -52,11 +52,15 @@ def start_run(run: Path, settings: Settings) -> None:
 
 @contextmanager
 def claimed(run: Path) -> Iterator[None]:
-    """Keeps other processes away from a run while it is trained.
+    """Makes a run's folder where missing, and keeps other processes away from it while it is trained.
 
     Raises:
-        InputError: another process trains it.
+        InputError: another process trains it, or the folder cannot be made.
     """
+    try:
+        run.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{run}: cannot be made ({error.strerror}); choose another run_dir") from error
     with held(run / RUNNING) as mine:
         if not mine:
             raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")

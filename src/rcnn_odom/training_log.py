@@ -74,7 +74,8 @@ class TrainingLog(Callback):
         self._windows += windows
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + windows * value
-        if trainer.global_step % EVERY == 0 and trainer.logger:
+        assert trainer.logger is not None
+        if trainer.global_step % EVERY == 0:
             points = {f"train/{name}_step": value for name, value in values.items()}
             trainer.logger.log_metrics({"train/learning_rate": self._rate, **points}, trainer.global_step - 1)
 
@@ -83,9 +84,9 @@ class TrainingLog(Callback):
         self.seconds = time.monotonic() - self._begun
         sums, windows = self._of_all_processes(trainer)
         means = {name: total / windows for name, total in sums.items()}
-        if trainer.logger:
-            points = {f"train/{name}_epoch": mean for name, mean in means.items()}
-            trainer.logger.log_metrics({"epoch": trainer.current_epoch, **points}, trainer.global_step - 1)
+        points = {f"train/{name}_epoch": mean for name, mean in means.items()}
+        assert trainer.logger is not None
+        trainer.logger.log_metrics({"epoch": trainer.current_epoch, **points}, trainer.global_step - 1)
         self._say(trainer, means["loss"])
 
     def _of_all_processes(self, trainer: L.Trainer) -> tuple[dict[str, float], float]:

@@ -3,6 +3,7 @@
 import argparse
 import json
 import shlex
+from collections.abc import Callable
 from pathlib import Path
 
 from rcnn_odom.cli.arguments import Subcommands, whole_number
@@ -32,6 +33,12 @@ def add(commands: Subcommands) -> None:
         metavar="N",
         help="scans in each sequence, whatever its name and scale",
     )
+    _add_world(add)
+    parser.set_defaults(run=_run_simulate)
+
+
+def _add_world(add: Callable[..., argparse.Action]) -> None:
+    """Adds what the worlds are like."""
     add(
         "--scale",
         choices=["small", "full"],
@@ -59,7 +66,6 @@ def add(commands: Subcommands) -> None:
         default=[],
         help="leave out what moves, missing returns, or slopes and the car's tilt; can be repeated",
     )
-    parser.set_defaults(run=_run_simulate)
 
 
 def _run_simulate(arguments: argparse.Namespace) -> int:
