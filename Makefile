@@ -20,10 +20,10 @@ fuzz: install
 	$(BIN)/pytest tests/test_fuzz.py --hypothesis-profile=long
 
 bench: install
-	$(BIN)/python -m rcnn_odom.bench
+	$(BIN)/python -m rcnn_odom.training.bench
 
 bench-train: install
-	$(BIN)/python -m rcnn_odom.bench_train
+	$(BIN)/python -m rcnn_odom.training.bench_train
 
 lint: install
 	$(BIN)/ruff check

@@ -9,7 +9,7 @@ import sys
 import hydra
 from omegaconf import DictConfig
 
-from rcnn_odom.job import run_command, run_job
+from rcnn_odom.training.job import run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
 
@@ -22,9 +22,9 @@ def evaluate(cfg: DictConfig) -> dict:
     """
     from pathlib import Path
 
-    from rcnn_odom import runs
     from rcnn_odom.errors import InputError
-    from rcnn_odom.settings import plain
+    from rcnn_odom.training import run_state as runs
+    from rcnn_odom.training.settings import plain
 
     variant = cfg.model.variant if cfg.get("model") else None
     if variant not in (None, "icp"):
@@ -47,10 +47,11 @@ def _estimate_run(chosen: dict) -> tuple[dict, dict]:
     import os
     from pathlib import Path
 
-    from rcnn_odom import experiment, runs
-    from rcnn_odom.checkpoint import load_module
-    from rcnn_odom.report import report_test
-    from rcnn_odom.scan import Sensor
+    from rcnn_odom.evaluation.run_report import report_test
+    from rcnn_odom.models.encoding import Sensor
+    from rcnn_odom.training import run_state as runs
+    from rcnn_odom.training import stages as experiment
+    from rcnn_odom.training.checkpoint import load_module
 
     run, folder = Path(chosen["run"]), Path(chosen["run_dir"])
     settings = runs.read_settings(run)
@@ -74,11 +75,11 @@ def _match_scans(chosen: dict) -> tuple[dict, dict]:
 
     from hydra.utils import instantiate
 
-    from rcnn_odom.baselines.constant import mean_motion
-    from rcnn_odom.baselines.icp import PointToLineICP
-    from rcnn_odom.datamodule import OdometryDataModule
-    from rcnn_odom.report import report_icp
-    from rcnn_odom.scan import Sensor
+    from rcnn_odom.evaluation.run_report import report_icp
+    from rcnn_odom.models.constant import mean_motion
+    from rcnn_odom.models.encoding import Sensor
+    from rcnn_odom.models.icp import PointToLineICP
+    from rcnn_odom.training.datamodule import OdometryDataModule
 
     data, sensor = chosen["data"], Sensor(**chosen["data"]["sensor"])
     icp = PointToLineICP(sensor, **{key: value for key, value in chosen["model"].items() if key != "variant"})

@@ -7,7 +7,7 @@ from functools import partial
 import hydra
 from omegaconf import DictConfig
 
-from rcnn_odom.job import in_sweep, run_command, run_job
+from rcnn_odom.training.job import in_sweep, run_command, run_job
 
 log = logging.getLogger("rcnn_odom")
 
@@ -27,11 +27,12 @@ def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
     # Here and not above: `--help` and a mistyped option should not wait for torch.
     from pathlib import Path
 
-    from rcnn_odom import experiment, runs
     from rcnn_odom.errors import InputError
-    from rcnn_odom.lock import one_at_a_time
-    from rcnn_odom.saving import Stopped
-    from rcnn_odom.settings import plain
+    from rcnn_odom.files import one_at_a_time
+    from rcnn_odom.training import run_state as runs
+    from rcnn_odom.training import stages as experiment
+    from rcnn_odom.training.saving import Stopped
+    from rcnn_odom.training.settings import plain
 
     if cfg.model.variant == "icp":
         raise InputError("model=icp has nothing to train; score it: python evaluate.py model=icp data=...")

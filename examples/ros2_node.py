@@ -12,9 +12,9 @@ returns) is logged as a warning; a late scan is not published. The file can be i
 import math
 from contextlib import suppress
 
-from rcnn_odom.datasets.rosbag import convert
-from rcnn_odom.datasets.stream import Scan, ScanStream, need_fitting_scan
-from rcnn_odom.odometer import LATE, Odometer, Pose
+from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
+from rcnn_odom.recordings.formats import Scan, ScanStream, need_fitting_scan
+from rcnn_odom.recordings.rosbag import convert
 
 
 def fill(message, pose: Pose, seconds: float) -> None:

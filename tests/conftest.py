@@ -10,6 +10,8 @@ from hydra import compose, initialize_config_dir
 from data.make_kitti import make_kitti
 
 ROOT = Path(__file__).parents[1]
+SHARED = ROOT.parent / "shared"
+"""Real recordings; tests that need them skip where they are absent."""
 sys.path.insert(0, str(ROOT))
 
 # Damaged files are read from disk, which knows no deadline. The short mode tries the same cases every time.

@@ -3,8 +3,8 @@
 import numpy as np
 import torch
 
-from rcnn_odom.modules import VARIANTS
-from rcnn_odom.scan import Sensor
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.training.modules import VARIANTS
 
 SENSOR = Sensor(1.0, 180.0, 40.0)
 ANGLES = np.deg2rad(np.arange(181) - 90.0)

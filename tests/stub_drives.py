@@ -6,9 +6,9 @@ from zlib import crc32
 
 import numpy as np
 
-from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
-from rcnn_odom.motion import planar_to_poses
+from rcnn_odom.geometry import planar_to_poses
+from rcnn_odom.recordings.recording import Sequence
 
 FRAMES = {"00": 150, "02": 70, "10": 40, "05": 40}
 
@@ -31,7 +31,7 @@ class Scans:
 
 
 def read(name, seed=0, broken="", seconds=0.0, frames=None, **options):
-    """A drive for any name, as ``rcnn_odom.datasets.simulated.load``; ``NAME~K`` is as long as NAME."""
+    """A drive for any name, as ``rcnn_odom.recordings.simulated.load``; ``NAME~K`` is as long as NAME."""
     frames = frames or FRAMES[name.split("~")[0]]
     steps = np.random.default_rng([seed, crc32(name.encode())]).uniform(
         [0.5, -0.05], [1.5, 0.05], (frames, 2)

@@ -5,7 +5,7 @@ import json
 import numpy as np
 import yaml
 
-from rcnn_odom.trajectory import write_kitti, write_tum
+from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
 FRAMES = {"05": 401, "07": 301}
 LENGTHS = [50.0, 100.0, 150.0]

@@ -10,7 +10,7 @@ from rcnn_odom.cli.arguments import Subcommands, whole_number
 from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
-    from rcnn_odom.metrics.drift import Drift
+    from rcnn_odom.evaluation.drift import Drift
 
 
 def add(commands: Subcommands) -> None:
@@ -52,8 +52,8 @@ def _parse_lengths(text: str) -> tuple[float, ...]:
 
 
 def _run_drift(arguments: argparse.Namespace) -> int:
-    from rcnn_odom.metrics.drift import KITTI_LENGTHS, drift, fitting_lengths, travelled
-    from rcnn_odom.trajectory import flatten, read_kitti
+    from rcnn_odom.evaluation.drift import KITTI_LENGTHS, drift, fitting_lengths, travelled
+    from rcnn_odom.recordings.trajectory import flatten, read_kitti
 
     truth, estimate = read_kitti(arguments.truth), read_kitti(arguments.estimate)
     lengths = sorted(set(arguments.lengths or KITTI_LENGTHS))

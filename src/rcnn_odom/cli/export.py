@@ -47,8 +47,8 @@ def add(commands: Subcommands) -> None:
 
 
 def _run_export(arguments: argparse.Namespace) -> int:
-    from rcnn_odom.export_job import export_checkpoint, export_unscored
-    from rcnn_odom.runs import BEST
+    from rcnn_odom.training.export import export_checkpoint, export_unscored
+    from rcnn_odom.training.run_state import BEST
 
     checkpoint = arguments.checkpoint
     if checkpoint.is_dir():

@@ -43,8 +43,8 @@ def _parse_frames(text: str) -> tuple[int, int]:
 
 
 def _run_frames(arguments: argparse.Namespace) -> int:
-    from rcnn_odom.evaluation import frame_table, stretch_errors
-    from rcnn_odom.trajectory import read_motions
+    from rcnn_odom.evaluation.scores import frame_table, stretch_errors
+    from rcnn_odom.recordings.trajectory import read_motions
 
     truth, estimates = read_motions(arguments.motions)
     first, last = arguments.frames or (1, len(truth))

@@ -12,11 +12,11 @@ if TYPE_CHECKING:
     import numpy as np
     import numpy.typing as npt
 
-    from rcnn_odom.motion import FloatArray
+    from rcnn_odom.geometry import FloatArray
 
 TUM_COLUMNS = 8
 LOOP_PATH = 5.0
-"""Metres, as in :mod:`rcnn_odom.metrics.relations`, which would slow ``--help`` down."""
+"""Metres, as in :mod:`rcnn_odom.evaluation.relations`, which would slow ``--help`` down."""
 
 
 def add(commands: Subcommands) -> None:
@@ -69,10 +69,10 @@ def _metres(text: str) -> float:
 def _run_relations(arguments: argparse.Namespace) -> int:
     import numpy as np
 
-    from rcnn_odom.datasets import carmen
-    from rcnn_odom.metrics.drift import travelled
-    from rcnn_odom.metrics.relations import read_relations, score_relations, stamp_keys
-    from rcnn_odom.motion import FORWARD_CAMERA, change_frame
+    from rcnn_odom.evaluation.drift import travelled
+    from rcnn_odom.evaluation.relations import read_relations, score_relations, stamp_keys
+    from rcnn_odom.geometry import FORWARD_CAMERA, change_frame
+    from rcnn_odom.recordings import carmen
 
     if not arguments.log.is_file():
         raise InputError(f"{arguments.log}: no such file; give the log that the relations are of")
@@ -93,8 +93,8 @@ def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "Floa
     """Poses (N, 4, 4) for all stamps (N,) of the log, nan where the file has none."""
     import numpy as np
 
-    from rcnn_odom.metrics.relations import stamp_keys
-    from rcnn_odom.trajectory import read_kitti, read_tum
+    from rcnn_odom.evaluation.relations import stamp_keys
+    from rcnn_odom.recordings.trajectory import read_kitti, read_tum
 
     if _count_columns(path) != TUM_COLUMNS:
         poses = read_kitti(path)

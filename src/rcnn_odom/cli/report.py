@@ -44,7 +44,7 @@ def add(commands: Subcommands) -> None:
 
 
 def _run_report(arguments: argparse.Namespace) -> int:
-    from rcnn_odom.summary.build import make_report
+    from rcnn_odom.evaluation.sweep_report.build import make_report
 
     written = make_report(arguments.directory, arguments.only, arguments.reference)
     if arguments.json:

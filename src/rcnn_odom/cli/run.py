@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from rcnn_odom.cli.arguments import Subcommands, whole_number
 
 if TYPE_CHECKING:
-    from rcnn_odom.odometer import Odometer
+    from rcnn_odom.deployment.odometer import Odometer
 
 
 def add(commands: Subcommands) -> None:
@@ -53,9 +53,9 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     if not arguments.live and arguments.out is None:
         parser.error("--out DIR is needed")
 
-    from rcnn_odom.datasets import json_lines
-    from rcnn_odom.datasets.stream import open_stream
-    from rcnn_odom.run import format_summary, print_pose, run
+    from rcnn_odom.deployment.run import format_summary, print_pose, run
+    from rcnn_odom.recordings import json_lines
+    from rcnn_odom.recordings.formats import open_stream
 
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     odometer = _load(arguments.model, arguments.threads)
@@ -80,7 +80,7 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
 
 
 def _load(model: str, threads: int) -> "Odometer":
-    from rcnn_odom.odometer import Odometer
+    from rcnn_odom.deployment.odometer import Odometer
 
     if not model.endswith(".ckpt"):
         return Odometer.from_onnx(model, threads=threads)

@@ -69,8 +69,8 @@ def _add_world(add: Callable[..., argparse.Action]) -> None:
 
 
 def _run_simulate(arguments: argparse.Namespace) -> int:
-    from rcnn_odom.datasets import simulated
-    from rcnn_odom.datasets.export import export_kitti, need_free_name
+    from rcnn_odom.recordings import simulated
+    from rcnn_odom.recordings.kitti_writer import export_kitti, need_free_name
 
     root, names = arguments.out, list(dict.fromkeys(arguments.sequence))
     for name in names:

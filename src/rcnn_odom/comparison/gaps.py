@@ -13,13 +13,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from rcnn_odom.cache import EncodedSequence
-from rcnn_odom.checkpoint import load_module
-from rcnn_odom.evaluation import aligned
-from rcnn_odom.experiment import build_datamodule
-from rcnn_odom.modules import OdometryModule
-from rcnn_odom.motion import FloatArray, motion_errors, relative_motions
-from rcnn_odom.runs import BEST, read_settings
+from rcnn_odom.evaluation.scores import aligned
+from rcnn_odom.geometry import FloatArray, motion_errors, relative_motions
+from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.training.checkpoint import load_module
+from rcnn_odom.training.modules import OdometryModule
+from rcnn_odom.training.run_state import BEST, read_settings
+from rcnn_odom.training.stages import build_datamodule
 
 EVERY = 20
 GAPS = (1, 2, 3, 4)

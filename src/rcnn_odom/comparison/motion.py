@@ -13,15 +13,15 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from rcnn_odom.datasets.kitti import read_calibration
 from rcnn_odom.errors import InputError
-from rcnn_odom.metrics.drift import drift
-from rcnn_odom.motion import FORWARD_CAMERA, FloatArray, change_frame, compose, relative_motions
-from rcnn_odom.simulation.city import random_plan, random_warp
-from rcnn_odom.simulation.drive import random_drive
-from rcnn_odom.simulation.speed import FRAME_TIME
-from rcnn_odom.simulation.terrain import flat_ground, stand
-from rcnn_odom.trajectory import read_kitti
+from rcnn_odom.evaluation.drift import drift
+from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame, compose, relative_motions
+from rcnn_odom.recordings.kitti import read_calibration
+from rcnn_odom.recordings.trajectory import read_kitti
+from rcnn_odom.simulation.street.city import random_plan, random_warp
+from rcnn_odom.simulation.street.drive import random_drive
+from rcnn_odom.simulation.street.speed import FRAME_TIME
+from rcnn_odom.simulation.street.terrain import flat_ground, stand
 
 SEQUENCES = {"00": 4541, "02": 4661, "03": 801, "04": 271, "06": 1101, "08": 4071, "09": 1591}
 """Frames of KITTI's sequences from which the simulator's motion was learnt."""

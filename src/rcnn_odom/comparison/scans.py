@@ -14,12 +14,12 @@ from pathlib import Path
 
 import numpy as np
 
-from rcnn_odom.datasets import carmen, kitti, simulated
-from rcnn_odom.datasets.sequence import Sequence
 from rcnn_odom.errors import InputError
-from rcnn_odom.motion import relative_motions
-from rcnn_odom.scan import Sensor, encode
-from rcnn_odom.simulation.city import RESIDENTIAL
+from rcnn_odom.geometry import relative_motions
+from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.recordings import carmen, kitti, simulated
+from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.simulation.street.city import RESIDENTIAL
 
 SENSOR = Sensor()
 ROBOT_SENSOR = Sensor(**simulated.SENSORS["indoor"])

@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.motion import FloatArray
+from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Material, Walls, join
 
 HEIGHTS = (-1.0, 3.0)

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.motion import FloatArray
-from rcnn_odom.scan import Sensor
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.simulation.raycast import NO_WALL, cast
 from rcnn_odom.simulation.scene import Material, Scene
 

@@ -1,1 +1,0 @@
-"""Estimators that are not trained networks, behind the same interface."""

@@ -1,1 +1,0 @@
-"""Recordings on disk: one file, one format; each gives the same `Sequence`."""

@@ -1,0 +1,1 @@
+"""One scan in, one pose out; needs neither torch nor Lightning."""

@@ -1,0 +1,221 @@
+"""A trained network over a recording or a live laser: ``rcnn-odom run``."""
+
+import json
+import logging
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable
+from contextlib import ExitStack, closing
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, TextIO, cast
+
+import numpy as np
+import numpy.typing as npt
+from tqdm import tqdm
+
+from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
+from rcnn_odom.deployment.sampling import Thinned
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import change_frame
+from rcnn_odom.recordings.formats import Scan, ScanStream, need_fitting_scan
+from rcnn_odom.recordings.trajectory import write_kitti, write_tum
+
+log = logging.getLogger(__name__)
+
+TRAJECTORY, TUM, STEPS, MAP, SUMMARY = (
+    "trajectory.txt",
+    "trajectory.tum",
+    "steps.jsonl",
+    "map.png",
+    "summary.json",
+)
+MAP_SCANS = 2000
+"""Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
+LATENCIES = 100_000
+
+Summary = dict[str, Any]
+
+
+def run(
+    odometer: Odometer,
+    stream: ScanStream,
+    model: str,
+    out: Path | None = None,
+    tell: Callable[[Pose], object] | None = None,
+) -> Summary:
+    """Poses for all scans of a stream.
+
+    What is written is valid at every moment, and complete up to the scan where a stream breaks off or
+    the run is stopped.
+
+    Args:
+        odometer: at its start.
+        stream: the scans.
+        model: what to call the network.
+        out: folder for trajectories, steps, map and summary; it must not hold a trajectory yet.
+        tell: gets every pose as soon as it is known.
+
+    Returns:
+        What ``summary.json`` holds: counts, path, and the time of a scan.
+
+    Raises:
+        InputError: the folder holds a trajectory or cannot be written, the laser is another than the
+            model's, the stream has no scan or breaks off.
+    """
+    record = Record(stream, model)
+    with ExitStack() as stack:
+        folder = stack.enter_context(closing(RunFolder(out, stream))) if out else None
+        bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
+        try:
+            for scan in stack.enter_context(closing(bar)):
+                pose = record.step(odometer, scan)
+                if folder:
+                    folder.add(pose)
+                if tell:
+                    tell(pose)
+            if not record.scans:
+                raise InputError(f"{stream.name}: no scan in it")
+        except BaseException as error:
+            record.stopped = str(error) or type(error).__name__
+            raise
+        finally:
+            if folder:
+                folder.finish(record)
+    return record.summary()
+
+
+class Record:
+    """What is counted and sampled along a run, in constant memory.
+
+    Args:
+        stream: the scans.
+        model: what to call the network.
+    """
+
+    def __init__(self, stream: ScanStream, model: str) -> None:
+        self.stream, self.model = stream, model
+        self.scans, self.path, self.longest, self.stopped = 0, 0.0, 0.0, ""
+        self._fits = False
+        self.degraded: Counter[str] = Counter()
+        self.milliseconds = Thinned[float](LATENCIES)
+        self.seen = Thinned[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
+
+    def step(self, odometer: Odometer, scan: Scan) -> Pose:
+        """One scan through the odometer, timed and counted.
+
+        Raises:
+            InputError: the first scan that has a range is of another laser than the model's.
+        """
+        if not self._fits and (scan.ranges > 0).any():
+            need_fitting_scan(self.stream, scan, odometer.description.sensor)
+            self._fits = True
+        start = time.perf_counter()
+        pose = odometer.step(scan.ranges, scan.stamp if self.stream.has_clock else None, scan.angles)
+        milliseconds = 1e3 * (time.perf_counter() - start)
+        self.scans += 1
+        self.path += abs(pose.distance)
+        self.longest = max(self.longest, milliseconds)
+        self.milliseconds.add(lambda: milliseconds)
+        self.degraded.update(note.split(":")[0] for note in pose.degraded.split("; ") if note)
+        self.seen.add(lambda: (pose, odometer.returns()))
+        # A scan that was passed over keeps the stamp of the pose that it repeats.
+        return pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
+
+    def summary(self) -> Summary:
+        """Plain values."""
+        median, p99 = np.percentile(self.milliseconds.items, [50, 99]).tolist()
+        return {
+            "input": self.stream.name,
+            "model": self.model,
+            "scans": self.scans,
+            "path_m": self.path,
+            "degraded": dict(self.degraded),
+            "skipped": dict(self.stream.skipped),
+            "latency": {"median_ms": median, "p99_ms": p99, "max_ms": self.longest},
+            **({"stopped": self.stopped} if self.stopped else {}),
+        }
+
+
+class RunFolder:
+    """The files of a run, begun with the first pose, each line written as soon as it is known.
+
+    Args:
+        folder: to write to, made where missing.
+        stream: the scans, for the frame of the trajectories.
+
+    Raises:
+        InputError: the folder holds a trajectory already.
+    """
+
+    def __init__(self, folder: Path, stream: ScanStream) -> None:
+        self.folder, self.stream = folder, stream
+        self._files, self._written = ExitStack(), 0
+        if (folder / TRAJECTORY).exists():
+            raise InputError(f"{folder}: holds a trajectory already; choose another --out")
+
+    def _begin(self) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._kitti, self._tum, self._steps = (self._open(name) for name in (TRAJECTORY, TUM, STEPS))
+        except OSError as error:
+            raise InputError(
+                f"{self.folder}: cannot be written ({error.strerror}); choose another --out"
+            ) from error
+
+    def _open(self, name: str) -> TextIO:
+        # Line by line, so that a run that is killed leaves no half of one.
+        return cast(TextIO, self._files.enter_context((self.folder / name).open("w", buffering=1)))
+
+    def add(self, pose: Pose) -> None:
+        """One more pose; without a stamp it is written under its number, a late one under no time.
+
+        Raises:
+            InputError: the folder cannot be written.
+        """
+        if not self._written:
+            self._begin()
+        camera_pose = change_frame(pose.matrix()[None], self.stream.camera_from_laser)
+        write_kitti(self._kitti, camera_pose)
+        if not pose.degraded.startswith(LATE):
+            write_tum(self._tum, [self._written if pose.stamp is None else pose.stamp], camera_pose)
+        self._steps.write(json.dumps(pose.as_dict()) + "\n")
+        self._written += 1
+
+    def finish(self, record: Record) -> None:
+        """The map and the summary, where there is a pose."""
+        if not self._written:
+            return
+        from rcnn_odom.evaluation.figures import map_figure
+
+        (self.folder / SUMMARY).write_text(json.dumps(record.summary(), indent=2) + "\n")
+        poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in record.seen.items])
+        points = [points for _, points in record.seen.items]
+        title = f"{self.stream.name} by {record.model}: {record.scans} scans, {record.path:.0f} m"
+        map_figure(title, poses, points).savefig(self.folder / MAP, dpi=150)
+
+    def close(self) -> None:
+        """Ends the files of lines."""
+        self._files.close()
+
+
+def format_summary(summary: Summary) -> str:
+    """Lines for people."""
+    times = summary["latency"]
+    lines = [f"{summary['input']}: {summary['scans']} scans, {summary['path_m']:.1f} m by {summary['model']}"]
+    for title in ("degraded", "skipped"):
+        if summary[title]:
+            counts = ", ".join(f"{count} {kind}" for kind, count in summary[title].items())
+            lines.append(f"{title}: {counts}")
+    lines.append(
+        f"time of a scan: median {times['median_ms']:.2f} ms, 99th percentile {times['p99_ms']:.2f}, longest "
+        f"{times['max_ms']:.2f}"
+    )
+    return "\n".join(lines)
+
+
+def print_pose(pose: Pose) -> None:
+    """A pose as a line of JSON on standard output, at once."""
+    sys.stdout.write(json.dumps(pose.as_dict()) + "\n")
+    sys.stdout.flush()

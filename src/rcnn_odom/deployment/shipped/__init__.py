@@ -1,0 +1,25 @@
+"""Trained networks that ship with the project, each with its model card."""
+
+from pathlib import Path
+
+from rcnn_odom.errors import InputError
+
+FOLDER = Path(__file__).parent
+
+
+def shipped() -> list[str]:
+    """Names of the models."""
+    return sorted(path.stem for path in FOLDER.glob("*.onnx"))
+
+
+def find_model(path: str | Path) -> Path:
+    """A file by its path, or a model that ships with the project by its name.
+
+    Raises:
+        InputError: neither is there.
+    """
+    if Path(path).is_file():
+        return Path(path)
+    if str(path) in shipped():
+        return FOLDER / f"{path}.onnx"
+    raise InputError(f"{path}: no such file, nor a model that ships with rcnn-odom ({', '.join(shipped())})")

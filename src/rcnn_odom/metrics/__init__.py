@@ -1,1 +1,0 @@
-"""Drift: a functional in numpy and a torchmetrics class that calls it."""

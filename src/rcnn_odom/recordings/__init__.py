@@ -1,0 +1,1 @@
+"""Recordings on disk and live, as scans."""

@@ -1,0 +1,281 @@
+"""Trajectory files: KITTI and TUM text formats, and motions as CSV; camera poses flattened to a plane.
+
+Poses here are (N, 4, 4) from the camera's frame (x right, y down, z forward) to a fixed frame.
+"""
+
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import TextIO
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FloatArray
+
+
+def file_name(sequence: str) -> str:
+    """A sequence's name as it stands in names of files: ``c[0.5:]`` becomes ``c_0.5-``."""
+    return re.sub(r"[^\w.-]+", "_", sequence.replace(":", "-")).strip("_")
+
+
+def read_kitti(path: str | Path) -> FloatArray:
+    """Read a KITTI trajectory: a line for each frame, the upper 3x4 of the pose, row by row.
+
+    Args:
+        path: text file of 12 numbers a line; blank lines are allowed at the end only.
+
+    Returns:
+        Poses (N, 4, 4), N >= 1, translations in metres.
+
+    Raises:
+        InputError: the file cannot be read or is empty, or a line (which is named) does not hold
+            12 finite numbers with a rotation among them.
+    """
+    lines = _read_lines(path, "give a file with 12 numbers a line, one line a frame")
+    poses = np.tile(np.eye(4), (len(lines), 1, 1))
+    for number, line in enumerate(lines, start=1):
+        poses[number - 1, :3] = _parse_row(line, f"{path}:{number}")
+    return poses
+
+
+def _read_lines(path: str | Path, wanted: str) -> list[str]:
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}; {wanted}") from error
+    if not lines:
+        raise InputError(f"{path}: is empty; {wanted}")
+    return lines
+
+
+def _parse_row(line: str, where: str) -> FloatArray:
+    fields = line.split()
+    if len(fields) != 12:
+        raise InputError(
+            f"{where}: found {len(fields)} fields where a KITTI pose has 12 numbers; correct the line"
+        )
+    try:
+        row = np.array([float(field) for field in fields])
+    except ValueError as error:
+        raise InputError(f"{where}: not a KITTI pose of 12 numbers ({error}); correct the line") from error
+    if not np.isfinite(row).all():
+        raise InputError(f"{where}: a pose must be finite, found nan or inf; correct the line")
+    pose = row.reshape(3, 4)
+    if not is_rotation(pose[:, :3]):
+        raise InputError(
+            f"{where}: the 3x3 part of a pose must be a rotation, and this one is not; correct the line"
+        )
+    return pose
+
+
+def is_rotation(matrix: FloatArray) -> bool:
+    """Whether a matrix (3, 3) of finite numbers turns without stretching, to a hundredth."""
+    # Large numbers first: their determinant would overflow.
+    return bool((np.abs(matrix) < 1.01).all()) and abs(np.linalg.det(matrix) - 1) < 0.01
+
+
+def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
+    """Read lines of ``stamp x y z qx qy qz qw``, as :func:`write_tum` writes them; # begins a comment.
+
+    Returns:
+        Stamps (N,) in seconds and poses (N, 4, 4).
+
+    Raises:
+        InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
+            finite numbers with a quaternion of unit length among them.
+    """
+    from scipy.spatial.transform import Rotation
+
+    rows = read_numbers(path, 8, "a TUM pose has 8 numbers, stamp x y z qx qy qz qw")
+    strange = np.flatnonzero(np.abs(np.linalg.norm(rows[:, 4:], axis=1) - 1) > 0.01)
+    if len(strange):
+        raise InputError(
+            f"{path}: the pose of {rows[strange[0], 0]:.6f} s has no unit quaternion as its last four "
+            "numbers; correct it"
+        )
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_quat(rows[:, 4:]).as_matrix()
+    poses[:, :3, 3] = rows[:, 1:4]
+    return rows[:, 0], poses
+
+
+def read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
+    """Lines of so many numbers as rows (N, columns), N >= 1; lines that begin with # are comments.
+
+    Args:
+        path: of the text file.
+        columns: numbers a line.
+        wanted: what a line should hold, for the message.
+
+    Raises:
+        InputError: the file cannot be read or holds no line, or a line (which is named) does not hold so
+            many finite numbers.
+    """
+    lines = _read_lines(path, wanted)
+    rows = []
+    for number, line in enumerate(lines):
+        if line.startswith("#"):
+            continue
+        try:
+            row = [float(word) for word in line.split()]
+        except ValueError:
+            row = []
+        if len(row) != columns or not np.isfinite(row).all():
+            raise InputError(
+                f"{path}:{number + 1}: found '{line.strip()[:40]}', but {wanted}; correct the line"
+            )
+        rows.append(row)
+    if not rows:
+        raise InputError(f"{path}: has comments alone; {wanted}")
+    return np.array(rows)
+
+
+def write_kitti(path: str | Path | TextIO, poses: npt.ArrayLike) -> None:
+    """Write poses (N, 4, 4) in KITTI's format, in full precision: `read_kitti` returns the same numbers.
+
+    Rounding would matter more than it seems: at a constant speed a distance may equal a segment's
+    length, and the last digit then decides where the segment ends. Into a file that is open the lines are
+    added.
+
+    Raises:
+        ValueError: ``poses`` has another shape.
+    """
+    poses = _check_shape(poses)
+    np.savetxt(path, poses[:, :3].reshape(-1, 12), fmt="%.16e")
+
+
+def write_tum(path: str | Path | TextIO, stamps: npt.ArrayLike, poses: npt.ArrayLike) -> None:
+    """Write lines of ``stamp x y z qx qy qz qw``, the format of the TUM RGB-D benchmark.
+
+    Args:
+        path: text file to write, or one that is open for writing and gets more lines.
+        stamps: times (N,) in seconds.
+        poses: (N, 4, 4), translations in metres. The frame is kept: camera poses stay camera poses.
+
+    Raises:
+        ValueError: the shapes do not fit.
+    """
+    poses = _check_shape(poses)
+    stamps = np.asarray(stamps, dtype=np.float64)
+    if stamps.shape != (len(poses),):
+        raise ValueError(f"stamps have shape {stamps.shape}, but there are {len(poses)} poses")
+    rows = np.column_stack([stamps, poses[:, :3, 3], _quaternions(poses[:, :3, :3])])
+    np.savetxt(path, rows, fmt=["%.9f"] + ["%.9e"] * 7)
+
+
+def _quaternions(rotations: FloatArray) -> FloatArray:
+    """Unit quaternions (N, 4) in the order x, y, z, w with w >= 0, of rotations (N, 3, 3).
+
+    Bar-Itzhack 2000: the eigenvector of the largest eigenvalue. Unlike the formula that divides by
+    the trace it has no weak spot at half turns, and bears rounded matrices.
+    """
+    (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotations, 0, -1)
+    rows = [
+        [xx - yy - zz, yx + xy, zx + xz, zy - yz],
+        [yx + xy, yy - xx - zz, zy + yz, xz - zx],
+        [zx + xz, zy + yz, zz - xx - yy, yx - xy],
+        [zy - yz, xz - zx, yx - xy, xx + yy + zz],
+    ]
+    quaternions: FloatArray = np.linalg.eigh(np.moveaxis(np.array(rows), -1, 0))[1][:, :, -1]
+    return np.where(quaternions[:, 3:] < 0, -quaternions, quaternions)
+
+
+def flatten(poses: npt.ArrayLike) -> FloatArray:
+    """Project camera poses on the x-z plane: x, z and the heading about y stay.
+
+    The heading is the direction of the forward axis (third column) in the plane; height, pitch and
+    roll are dropped.
+
+    Args:
+        poses: (N, 4, 4), camera frame.
+
+    Returns:
+        Planar poses (N, 4, 4) with y = 0 and rotations about y alone.
+
+    Raises:
+        ValueError: ``poses`` has another shape.
+    """
+    poses = _check_shape(poses)
+    heading = np.arctan2(poses[:, 0, 2], poses[:, 2, 2])
+    flat = np.tile(np.eye(4), (len(poses), 1, 1))
+    flat[:, 0, 0] = flat[:, 2, 2] = np.cos(heading)
+    flat[:, 0, 2] = np.sin(heading)
+    flat[:, 2, 0] = -flat[:, 0, 2]
+    flat[:, 0, 3], flat[:, 2, 3] = poses[:, 0, 3], poses[:, 2, 3]
+    return flat
+
+
+def _check_shape(poses: npt.ArrayLike) -> FloatArray:
+    poses = np.asarray(poses, dtype=np.float64)
+    if poses.ndim != 3 or poses.shape[1:] != (4, 4):
+        raise ValueError(f"poses must have shape (N, 4, 4), not {poses.shape}")
+    return poses
+
+
+def write_motions(
+    path: str | Path, motions: FloatArray, truth: FloatArray, baselines: Mapping[str, FloatArray]
+) -> None:
+    """Write CSV with a line for each motion, under the number of its later scan, in full precision.
+
+    Args:
+        path: file to write.
+        motions: estimated, (N, 2) metres and radians.
+        truth: (N, 2).
+        baselines: (N, 2) by the name of the method, which goes before the names of its columns.
+    """
+    rows = np.column_stack([np.arange(1, len(truth) + 1), motions, truth, *baselines.values()])
+    formats = ["%d"] + ["%.17g"] * (rows.shape[1] - 1)
+    header = ",".join(_motion_columns(baselines))
+    np.savetxt(path, rows, fmt=formats, delimiter=",", header=header, comments="")
+
+
+def _motion_columns(baselines: Iterable[str]) -> list[str]:
+    prefixes = ["", "true_", *(f"{name}_" for name in baselines)]
+    return ["frame", *(prefix + unit for prefix in prefixes for unit in ("distance_m", "heading_rad"))]
+
+
+def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
+    """Read what :func:`write_motions` wrote.
+
+    Returns:
+        The truth (N, 2), N >= 1, and motions (N, 2) by method, the first one called ``estimate``.
+
+    Raises:
+        InputError: the file cannot be read, has another header or no motion, or a line (which is named)
+            is not the next frame with a finite number in each column.
+    """
+    try:
+        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
+    header = lines[0].split(",") if lines else []
+    baselines = [name.removesuffix("_distance_m") for name in header[5::2]]
+    methods = ["estimate", "true", *baselines]
+    if header != _motion_columns(baselines) or len(set(methods)) < len(methods):
+        raise InputError(
+            f"{path}:1: the header must be {','.join(_motion_columns([]))}, then "
+            "METHOD_distance_m,METHOD_heading_rad for each other method, if any"
+        )
+    if len(lines) == 1:
+        raise InputError(f"{path}: has no motion under its header: give a file with one line a frame")
+    rows = [_parse_motions(line, frame, len(header), path) for frame, line in enumerate(lines[1:], start=1)]
+    columns = dict(zip(methods, np.split(np.array(rows), len(methods), axis=1), strict=True))
+    return columns.pop("true"), columns
+
+
+def _parse_motions(line: str, frame: int, columns: int, path: str | Path) -> list[float]:
+    where = f"{path}:{frame + 1}"
+    fields = line.split(",")
+    if len(fields) != columns:
+        raise InputError(f"{where}: found {len(fields)} fields where the header has {columns}")
+    try:
+        number, *motions = map(float, fields)
+    except ValueError as error:
+        raise InputError(f"{where}: not numbers: {error}") from error
+    if not np.isfinite(motions).all():
+        raise InputError(f"{where}: a motion must be finite, found nan or inf")
+    if number != frame:
+        raise InputError(f"{where}: frame {fields[0]} where {frame} comes: frames count 1, 2, 3, ...")
+    return motions

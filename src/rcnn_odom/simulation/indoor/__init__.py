@@ -1,0 +1,1 @@
+"""A building, its furniture and people, and a robot that drives through."""

@@ -1,0 +1,1 @@
+"""A city, its traffic, and a car that drives through."""

@@ -1,0 +1,75 @@
+"""How a car sways on its springs and tyres."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.simulation.street.speed import FRAME_TIME
+
+BUMP_FRAMES = 50
+"""Frames after which a bump is forgotten."""
+
+PITCH_OF_ACCELERATION = -0.0015
+"""Radians of pitch (nose down) for every m/s^2 of speeding up."""
+
+ROLL_OF_ACCELERATION = 0.0075
+"""Radians of roll (left side up) for every m/s^2 to the left: a body leans outwards."""
+
+
+@dataclass(frozen=True)
+class _Sway:
+    """Random tilt of one kind: noise of the road through a damped spring, and through slow leaning.
+
+    Attributes:
+        bounce_deg: standard deviation of the bounce on a usual road at 10 m/s.
+        frequency: of the bounce in hertz.
+        damping: of the bounce, as a share of the critical one.
+        lean_deg: standard deviation of the slow part.
+        lean_time: seconds after which it is forgotten.
+    """
+
+    bounce_deg: float
+    frequency: float
+    damping: float
+    lean_deg: float
+    lean_time: float
+
+
+PITCH_SWAY = _Sway(bounce_deg=0.215, frequency=1.25, damping=0.25, lean_deg=0.7, lean_time=0.8)
+ROLL_SWAY = _Sway(bounce_deg=0.175, frequency=1.0, damping=0.5, lean_deg=0.95, lean_time=0.8)
+YAW_SWAY = _Sway(bounce_deg=0.0, frequency=1.0, damping=0.5, lean_deg=0.12, lean_time=1.0)
+
+
+def sway(speed: FloatArray, aside: FloatArray, rough: float, rng: np.random.Generator) -> FloatArray:
+    """Pitch, roll and yaw (N, 3) of the car on its springs and tyres, radians.
+
+    Args:
+        speed: (N,) metres per second.
+        aside: (N,) m/s^2 to the left.
+        rough: of the road.
+        rng: of the road's bumps.
+    """
+    # A bump does nothing to a car that stands.
+    bumps = np.sqrt(np.clip(speed, 0, None) / 10)
+    bumps = np.concatenate([np.full(BUMP_FRAMES - 1, bumps[0]), bumps])
+    noise = rough * bumps[:, None] * rng.standard_normal((len(bumps), 6))
+    pitch = PITCH_OF_ACCELERATION * np.gradient(speed, FRAME_TIME) + _swing(PITCH_SWAY, noise[:, :2])
+    roll = ROLL_OF_ACCELERATION * aside + _swing(ROLL_SWAY, noise[:, 2:4])
+    return np.stack([pitch, roll, _swing(YAW_SWAY, noise[:, 4:])], axis=1)
+
+
+def _swing(kind: _Sway, noise: FloatArray) -> FloatArray:
+    """Radians (N,) after noise (N + BUMP_FRAMES - 1, 2) of the road went through bounce and lean."""
+    time = FRAME_TIME * np.arange(BUMP_FRAMES)
+    turned = 2 * np.pi * kind.frequency * time
+    bounce = np.exp(-kind.damping * turned) * np.sin(turned)
+    lean = time / kind.lean_time * np.exp(-time / kind.lean_time)
+    total: FloatArray = sum(
+        np.deg2rad(deviation_deg) * np.convolve(one, response / np.linalg.norm(response), mode="valid")
+        for deviation_deg, response, one in (
+            (kind.bounce_deg, bounce, noise[:, 0]),
+            (kind.lean_deg, lean, noise[:, 1]),
+        )
+    )
+    return total

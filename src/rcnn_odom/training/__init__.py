@@ -1,0 +1,1 @@
+"""Experiments: the only package that knows Lightning and Hydra."""

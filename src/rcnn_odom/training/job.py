@@ -1,0 +1,110 @@
+"""What stands around a Hydra job: its folder, and mistakes of the user as one line and an exit status."""
+
+import errno
+import logging
+import os
+import re
+import signal
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import TypeVar
+
+from hydra.core.hydra_config import HydraConfig
+from hydra.errors import HydraException
+from omegaconf import DictConfig, OmegaConf
+from omegaconf.errors import OmegaConfBaseException
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.training import (
+    run_folder,  # noqa: F401  resolvers of conf/config.yaml
+    sweep,  # noqa: F401  resolvers of conf/config.yaml
+)
+
+log = logging.getLogger(__name__)
+
+Result = TypeVar("Result")
+ERROR = "error.txt"
+"""In the folder of a sweep's job that failed: why, in one line."""
+
+_failed: list[Exception] = []
+
+
+def in_sweep() -> bool:
+    """Whether the present job is one of a multirun."""
+    return not OmegaConf.is_missing(HydraConfig.get().job, "num")
+
+
+def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
+    """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
+
+    The mistake is remembered for :func:`run_command`. In a sweep it is also written to ``error.txt`` in the
+    job's folder, and raised: Hydra goes on with the other jobs and raises it again at the end.
+
+    Raises:
+        KeyboardInterrupt: stopped, which also stops a sweep.
+        InputError, OSError: a mistake in a sweep.
+    """
+    folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
+    try:
+        if in_sweep():
+            _check_sweep()
+            (folder / ERROR).unlink(missing_ok=True)
+        elif "sweeps" in HydraConfig.get().runtime.choices:
+            raise InputError("+sweeps= needs -m: one run would take nothing from a sweep")
+        cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
+        return job(cfg)
+    except SystemExit:  # how Lightning ends after Ctrl-C
+        raise KeyboardInterrupt from None
+    except (InputError, OSError) as error:
+        is_full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+        full = "; make room, and the same command goes on" if is_full else ""
+        log.error("error: %s%s", error, full)
+        _failed.append(error)
+        if in_sweep():
+            _leave_error(folder, error)
+            raise
+        return None
+    except Exception as error:
+        if in_sweep():
+            _leave_error(folder, error)
+        raise
+
+
+def _check_sweep() -> None:
+    hydra = HydraConfig.get()
+    if any(override.split("=")[0] == "run_dir" for override in hydra.overrides.task):
+        raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
+
+
+def _leave_error(folder: Path, error: Exception) -> None:
+    with suppress(OSError):  # the error itself may be that nothing can be written
+        (folder / ERROR).write_text(" ".join(f"{type(error).__name__}: {error}".split()) + "\n")
+
+
+def run_command(main: Callable[[], object]) -> int:
+    """Runs a function decorated with ``hydra.main``; the exit status: 1 after a mistake of the user."""
+    # Hydra would print and exit by itself, also where a folder cannot be made.
+    os.environ.setdefault("HYDRA_FULL_ERROR", "1")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
+    logging.raiseExceptions = False  # a log on a full disk would otherwise print a traceback for every line
+    try:
+        main()
+    except KeyboardInterrupt:
+        return 130
+    except InputError:  # of a sweep's job, which has told
+        return 1
+    except ValueError as error:
+        if not _failed:
+            raise
+        # A sweeper that had no job to learn from; why they failed has been told.
+        print(f"error: {error}", file=sys.stderr)
+        return 1
+    except (HydraException, OmegaConfBaseException, OSError) as error:
+        # What follows is Hydra's own place in the configuration, not the user's mistake.
+        message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
+        hint = "; choose another outputs= or run_dir=" if isinstance(error, OSError) else ""
+        print(f"error: {' '.join(message.split())}{hint}", file=sys.stderr)
+        return 1
+    return 1 if _failed else 0

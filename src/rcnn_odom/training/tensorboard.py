@@ -1,0 +1,97 @@
+"""TensorBoard as a dashboard: the layout of its custom scalars, and a run's row of its HParams tab."""
+
+from typing import Any
+
+import lightning as L
+from lightning.pytorch.callbacks import Callback
+from lightning.pytorch.loggers import TensorBoardLogger
+from tensorboard.compat.proto.event_pb2 import Event, SessionLog
+from torch.utils.tensorboard.summary import hparams
+
+from rcnn_odom.training.settings import Settings, flat
+
+LAYOUT = {
+    "Loss": {
+        "loss": ["Multiline", ["train/loss_epoch"]],
+        "parts of the loss, of distance and rotation": [
+            "Multiline",
+            ["train/loss_distance_epoch", "train/loss_rotation_epoch"],
+        ],
+    },
+    "Drift (ratio)": {
+        "validation drift, the mean and each sequence": ["Multiline", ["val/drift.*"]],
+        "test drift, the mean and each sequence": ["Multiline", ["drift/test.*"]],
+    },
+    "Mean absolute error of a frame": {
+        "error of distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
+        "error of heading (degrees)": ["Multiline", ["(val|test)/heading_mae_deg"]],
+    },
+}
+"""Groups of charts by title, each with patterns of the scalars in it."""
+
+NOT_IN_ROW = (
+    "run_dir",
+    "outputs",
+    "data.reader",
+    "data.root",
+    "data.reference",
+    "data.workers",
+    "data.keep_worlds",
+)
+REPEATED = (
+    *("data.rotation_classes", "data.beta", "data.passes", "data.epochs"),
+    *("model.first_stage.kernel_size", "model.first_stage.pooling", "model.first_stage.rotation_classes"),
+)
+"""Settings that only stand for what ``model`` says as well."""
+
+CHOSEN_AS = {"model.variant": "model", "data.name": "data"}
+"""Settings whose column has the name of the choice on the command line, and so comes before its parts."""
+
+
+class Layout(Callback):
+    """Tells TensorBoard which scalars belong together."""
+
+    def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Called once, before the first scalar."""
+        if not trainer.is_global_zero:
+            return
+        assert isinstance(trainer.logger, TensorBoardLogger)
+        writer = trainer.logger.experiment
+        writer.add_custom_scalars(LAYOUT)
+        # A run that goes on, or begins again, will log what came after its last checkpoint once more.
+        start = SessionLog(status=SessionLog.START)
+        writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
+
+
+def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, Any], step: int) -> None:
+    """A finished run's row of the HParams tab: its settings, and drift as the metric; the scores as scalars.
+
+    No summary of an "experiment" is written, as Lightning would: the columns of the first run would stand for
+    those of all, in the order of the alphabet, and five are shown. Without it TensorBoard looks at all
+    runs, and shows first the settings in which they differ.
+
+    Args:
+        logger: of the run.
+        settings: of the run.
+        metrics: with ``val`` and ``test`` of what ``metrics.json`` holds.
+        step: training steps that it took.
+    """
+    row = {
+        CHOSEN_AS.get(name, name): value if type(value) in (int, float) else str(value)
+        for name, value in flat(settings).items()
+        if not name.startswith(NOT_IN_ROW + REPEATED)
+    }
+    test = metrics["test"]
+    # Not val/drift, whose curve another point would purge; and TensorBoard sorts metrics by the alphabet.
+    scores = {"drift/validation": metrics["val"]["drift"], "drift/test": test["drift"]}
+    for name, scored in test["sequences"].items():
+        scores[f"drift/test/{name}"] = scored["drift"]["t_err"]
+    for error in ("distance_mae_m", "heading_mae_deg"):
+        frames = [scored["frames"] - 1 for scored in test["sequences"].values()]
+        errors = [scored[error] for scored in test["sequences"].values()]
+        scores[f"test/{error}"] = sum(f * e for f, e in zip(frames, errors, strict=True)) / sum(frames)
+    known = {name: value for name, value in scores.items() if value is not None}
+    logger.log_metrics(known, step)
+    _, *summaries = hparams(row, known)
+    for summary in summaries:
+        logger.experiment.file_writer.add_summary(summary, step)

@@ -1,0 +1,361 @@
+"""Streaming odometry: the same numbers as a whole drive at once, and what may go wrong in a stream."""
+
+import math
+import tracemalloc
+
+import numpy as np
+import pytest
+import torch
+
+from odometry import ANGLES, NAMES, build, random_scans
+from rcnn_odom.deployment.odometer import LATE_IN_A_ROW, LONGEST_HOLD, Description, Odometer
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import advance, compose, poses_to_planar
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.training.checkpoint_stepper import CheckpointStepper
+from rcnn_odom.training.onnx_graph import to_onnx, write
+
+PERIOD = 0.1
+
+
+class Recorder:
+    """A stepper that notes what it is asked and always answers the same."""
+
+    description = Description(Sensor(1.0, 180.0, 40.0), "end", (0.6, 0.03), 0.5, PERIOD)
+    motion = np.array([0.5, 0.1])
+
+    def __init__(self):
+        self.pairs, self.resets = [], 0
+
+    def __call__(self, pair):
+        self.pairs.append(pair)
+        return self.motion, np.array([0.05, 0.01])
+
+    def reset(self):
+        self.resets += 1
+
+
+@pytest.fixture
+def recorder():
+    return Recorder()
+
+
+def drive(odometer, scans, first=0):
+    return [odometer.step(scan, PERIOD * (first + number), ANGLES) for number, scan in enumerate(scans)]
+
+
+def odometers(module, folder):
+    """The module's odometers from a checkpoint and from an ONNX file."""
+    torch.save(
+        {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)}, folder / "best.ckpt"
+    )
+    write(to_onnx(module, "fp32"), folder / "model.onnx")
+    return Odometer.from_checkpoint(folder / "best.ckpt"), Odometer.from_onnx(folder / "model.onnx")
+
+
+@pytest.mark.parametrize(("variant", "projection"), [*((name, None) for name in NAMES), ("rcnn_reg", 8)])
+def test_steps_equal_the_offline_estimate(variant, projection, tmp_path):
+    module = build(variant, projection)
+    scans = random_scans(150)  # more than two chunks of the offline estimate
+    offline = module.estimate(torch.from_numpy(scans))
+    expected = poses_to_planar(compose(offline.motions, "middle"))
+    for odometer in odometers(module, tmp_path):
+        poses = drive(odometer, scans)
+        streamed = np.array([[pose.x, pose.y, pose.heading] for pose in poses])
+        np.testing.assert_allclose(streamed[:, :2], expected[:, :2], atol=1e-5)
+        np.testing.assert_allclose(np.exp(1j * streamed[:, 2]), np.exp(1j * expected[:, 2]), atol=1e-5)
+        steps = np.array([[pose.distance, pose.turn] for pose in poses[1:]])
+        np.testing.assert_allclose(steps, offline.motions, atol=1e-5)
+        deviations = np.array([[pose.distance_deviation, pose.turn_deviation] for pose in poses[1:]])
+        np.testing.assert_allclose(deviations, offline.deviations, atol=1e-5)
+        assert not any(pose.degraded for pose in poses)
+
+
+def test_advance_is_a_step_of_compose():
+    motions = np.random.default_rng(0).normal(0, 0.5, (20, 2))
+    for apply in ("start", "middle", "end"):
+        pose, whole = np.zeros(3), poses_to_planar(compose(motions, apply))
+        for motion, expected in zip(motions, whole[1:], strict=True):
+            pose = advance(pose, motion, apply)
+            np.testing.assert_allclose(pose[:2], expected[:2], atol=1e-12)
+            assert math.remainder(pose[2] - expected[2], 2 * math.pi) == pytest.approx(0, abs=1e-12)
+
+
+def test_the_first_scan_is_the_origin_and_reset_begins_anew():
+    odometer = Odometer(CheckpointStepper(build()))
+    scans = random_scans(6)
+    first = drive(odometer, scans)
+    assert (first[0].x, first[0].y, first[0].heading) == (0, 0, 0)
+    np.testing.assert_array_equal(first[0].matrix(), np.eye(4))
+    odometer.reset()
+    assert drive(odometer, scans) == first
+
+
+def test_ranges_with_and_without_angles_and_points_are_the_same():
+    scans = random_scans(5).astype(np.float64)
+    expected = drive(Odometer(CheckpointStepper(build())), scans)
+    even, points = (Odometer(CheckpointStepper(build())) for _ in range(2))
+    for number, scan in enumerate(scans):
+        stamp = PERIOD * number
+        assert even.step(scan, stamp) == expected[number]
+        as_points = np.column_stack([scan * np.cos(ANGLES), scan * np.sin(ANGLES), np.ones(181)])
+        pose = points.step(as_points, stamp)
+        assert pose.x == pytest.approx(expected[number].x, abs=1e-6)
+
+
+def test_a_scan_without_returns_lets_the_last_motion_go_on(recorder):
+    scans = random_scans(7)
+    odometer = Odometer(recorder)
+    poses = drive(odometer, [*scans[:5], np.zeros(181), scans[5], scans[6]])
+    assert len(recorder.pairs) == 4 + 1, "neither the empty scan nor the pair across it reaches the network"
+    np.testing.assert_array_equal(recorder.pairs[-1], scans[5:])
+    path = poses_to_planar(compose(np.tile(Recorder.motion, (7, 1)), "end"))
+    np.testing.assert_allclose([[p.x, p.y, p.heading] for p in poses], path, atol=1e-12)
+    assert [bool(pose.degraded) for pose in poses] == [False] * 5 + [True, True, False]
+    assert "no returns" in poses[5].degraded
+    assert "gap: 2 periods" in poses[6].degraded
+    assert [(pose.distance, pose.distance_deviation) for pose in poses[5:7]] == [(0.5, 0.6)] * 2
+    assert recorder.resets == 1
+
+
+@pytest.mark.parametrize(
+    "nothing", [np.full(181, np.inf), np.full(181, np.nan), np.full(181, 40.0), np.zeros(0)]
+)
+def test_no_returns_in_other_words(recorder, nothing):
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(5))
+    pose = odometer.step(nothing, 0.5)
+    assert "no returns" in pose.degraded
+
+
+def test_nothing_at_first_is_still_the_origin(recorder):
+    odometer = Odometer(recorder)
+    pose = odometer.step(np.zeros(181), 0.0)
+    assert (pose.x, pose.y) == (0, 0)
+    assert "no returns" in pose.degraded
+    pose = odometer.step(random_scans(1)[0], 0.1)
+    assert (pose.x, pose.y, pose.degraded) == (0, 0, "")
+
+
+def test_dropped_scans_are_bridged_and_the_state_survives(recorder):
+    scans = random_scans(20)
+    odometer = Odometer(recorder)
+    before = drive(odometer, scans[:6])
+    after = odometer.step(scans[8], PERIOD * 8, ANGLES)
+    assert "gap: 3 periods" in after.degraded
+    pose = np.array([before[-1].x, before[-1].y, before[-1].heading])
+    for _ in range(3):
+        pose = advance(pose, Recorder.motion)
+    np.testing.assert_allclose([after.x, after.y, after.heading], pose)
+    assert (after.distance, after.distance_deviation) == pytest.approx((3 * 0.5, 3 * 0.6))
+    following = odometer.step(scans[9], PERIOD * 9, ANGLES)
+    assert following.degraded == ""
+    np.testing.assert_array_equal(recorder.pairs[-1], scans[8:10])
+    assert recorder.resets == 1
+
+
+def test_over_a_long_gap_the_motion_ends(recorder):
+    odometer = Odometer(recorder)
+    last = drive(odometer, random_scans(6))[-1]
+    pose = odometer.step(random_scans(1)[0], 3600.0, ANGLES)
+    assert math.hypot(pose.x - last.x, pose.y - last.y) <= LONGEST_HOLD * 0.5
+    assert pose.distance == pytest.approx(LONGEST_HOLD * 0.5)
+    assert pose.distance_deviation > 1000
+    odometer.reset()
+    drive(odometer, random_scans(6))
+    empty = [odometer.step(np.zeros(181), 0.1 * n) for n in range(6, 30)]
+    steps = [pose.distance for pose in empty]
+    assert steps == [0.5] * LONGEST_HOLD + [0.0] * (24 - LONGEST_HOLD), (
+        "held for so long, then standing still"
+    )
+    assert empty[-1].distance_deviation == pytest.approx(0.6)
+
+
+def test_a_late_scan_is_passed_over():
+    scans = random_scans(8)
+    straight, disturbed = (Odometer(CheckpointStepper(build())) for _ in range(2))
+    expected = drive(straight, scans)
+    drive(disturbed, scans[:5])
+    for stamp in (0.4, 0.1, -5.0):
+        late = disturbed.step(random_scans(1, seed=9)[0], stamp, ANGLES)
+        assert late.degraded.startswith("late scan")
+        assert (late.x, late.y, late.heading, late.stamp) == (
+            expected[4].x,
+            expected[4].y,
+            expected[4].heading,
+            0.4,
+        )
+        assert late.distance == 0
+    assert drive(disturbed, scans[5:], first=5) == expected[5:]
+
+
+def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(5))
+    empty = odometer.step(np.zeros(181), 0.5)
+    late = odometer.step(np.full(361, 5.0), 0.45)
+    assert (late.x, late.y, late.stamp, late.distance) == (empty.x, empty.y, 0.5, 0.0)
+    assert "beam count" in odometer.step(np.full(361, 5.0), 0.6).degraded, "of a scan that counts"
+
+
+@pytest.mark.parametrize("jump", [-1000.0, 1000.0])
+def test_a_clock_that_is_set_costs_a_few_scans(recorder, jump):
+    odometer, scans = Odometer(recorder), random_scans(60)
+    drive(odometer, scans[:20])
+    if jump > 0:  # one wild stamp, then the old clock again
+        odometer.step(scans[20], 2.0 + jump, ANGLES)
+    later = [odometer.step(scan, 2.1 + min(jump, 0) + 0.1 * n, ANGLES) for n, scan in enumerate(scans[21:])]
+    kinds = [pose.degraded.split(":")[0] for pose in later]
+    assert kinds == ["late scan"] * (LATE_IN_A_ROW - 1) + ["gap"] + [""] * (39 - LATE_IN_A_ROW)
+    assert later[LATE_IN_A_ROW - 1].distance in (pytest.approx(0.5 * LATE_IN_A_ROW), 0.0)
+    assert recorder.resets == 1
+
+
+def test_a_bursty_clock_is_no_gap(recorder):
+    """Scans that arrive in pairs, 10 ms apart every 200 ms."""
+    odometer = Odometer(recorder)
+    stamps = [0.2 * (number // 2) + 0.01 * (number % 2) for number in range(200)]
+    poses = [
+        odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(random_scans(200), stamps, strict=True)
+    ]
+    assert sum(pose.distance for pose in poses) == pytest.approx(0.5 * 199, rel=0.02)
+    assert sum(bool(pose.degraded) for pose in poses) <= 1
+
+
+def test_gaps_are_seen_from_the_first_scans_on(recorder):
+    odometer, scans = Odometer(recorder), random_scans(3)
+    odometer.step(scans[0], 0.0, ANGLES)
+    assert odometer.step(scans[1], 0.1, ANGLES).degraded == ""
+    assert "gap: 10 periods" in odometer.step(scans[2], 1.1, ANGLES).degraded
+
+
+def test_another_rate_than_trainings_is_told(recorder):
+    odometer = Odometer(recorder)
+    poses = [odometer.step(scan, 0.3 * number, ANGLES) for number, scan in enumerate(random_scans(20))]
+    assert all("gap" in pose.degraded for pose in poses[1:4])
+    assert [pose.degraded for pose in poses[10:]] == [
+        "slow scans: one every 0.3 s, in training every 0.1 s"
+    ] * 10
+    fast = Odometer(recorder)
+    poses = [fast.step(scan, 0.05 * number, ANGLES) for number, scan in enumerate(random_scans(20))]
+    assert [pose.degraded for pose in poses[10:]] == [
+        "fast scans: one every 0.05 s, in training every 0.1 s"
+    ] * 10
+
+
+@pytest.mark.parametrize("unstamped", [[7], range(3, 23), range(1, 40, 2)])
+def test_scans_without_stamps_among_others_count_once(recorder, unstamped):
+    odometer = Odometer(recorder)
+    for number, scan in enumerate(random_scans(40)):
+        pose = odometer.step(scan, None if number in unstamped else PERIOD * number, ANGLES)
+        assert pose.degraded == ""
+    assert len(recorder.pairs) == 39
+
+
+def test_wild_stamps_and_angles_do_not_raise(recorder):
+    odometer, scans = Odometer(recorder), random_scans(8)
+    drive(odometer, scans[:5])
+    assert "gap" in odometer.step(scans[5], 1e308, ANGLES).degraded
+    odometer.reset()
+    assert "no returns" in odometer.step(scans[6], 0.0, np.full(181, 1e307)).degraded
+
+
+def test_one_scan_without_a_stamp_does_not_forget_the_others(recorder):
+    odometer, scans = Odometer(recorder), random_scans(4)
+    for scan, stamp in zip(scans[:3], (1.0, 1.1, None), strict=True):
+        odometer.step(scan, stamp, ANGLES)
+    assert "late scan" in odometer.step(scans[3], 0.5, ANGLES).degraded
+
+
+def test_a_network_that_gives_nan_starts_anew(recorder):
+    odometer, scans = Odometer(recorder), random_scans(6)
+    drive(odometer, scans[:4])
+    recorder.motion = np.array([np.nan, 0.1])
+    broken = odometer.step(scans[4], 0.4, ANGLES)
+    assert broken.degraded == "no estimate: the last motion goes on"
+    assert (broken.distance, recorder.resets) == (0.5, 2)
+    del recorder.motion
+    assert odometer.step(scans[5], 0.5, ANGLES).degraded == ""
+
+
+def test_without_stamps_the_order_counts():
+    scans = random_scans(5)
+    odometer = Odometer(CheckpointStepper(build()))
+    expected = drive(Odometer(CheckpointStepper(build())), scans)
+    for scan, pose in zip(scans, expected, strict=True):
+        got = odometer.step(scan, float("nan"), ANGLES)
+        assert (got.x, got.y, got.stamp, got.degraded) == (pose.x, pose.y, None, "")
+
+
+def test_another_number_of_beams_is_told_and_goes_on(recorder):
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(3))
+    pose = odometer.step(np.full(361, 5.0), 0.3)
+    assert pose.degraded == "beam count: 361 after 181"
+    assert pose.distance == 0.5
+    assert recorder.pairs[-1].shape == (2, 181)
+    np.testing.assert_allclose(recorder.pairs[-1][1], 5.0)
+    assert odometer.step(np.full(361, 5.0), 0.4).degraded == ""
+
+
+def test_returns_alone_change_their_number_and_that_is_nothing(recorder):
+    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    for number in range(20):
+        returned = rng.random(181) < 0.9
+        pose = odometer.step(np.full(returned.sum(), 5.0), 0.1 * number, ANGLES[returned])
+        assert pose.degraded == ""
+    twice = np.deg2rad(np.arange(-90.0, 90.5, 0.5))
+    assert odometer.step(np.full(361, 5.0), 2.0, twice).degraded.startswith("beam count: 361 after")
+
+
+def test_few_returns_are_told(recorder):
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(3))
+    few = np.where(np.arange(181) < 60, 5.0, 0.0)
+    pose = odometer.step(few, 0.3)
+    assert pose.degraded == "few returns: 33.1% of the bins have one"
+    assert len(recorder.pairs) == 3
+
+
+def test_a_jittering_clock_is_no_gap(recorder):
+    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    for number, scan in enumerate(random_scans(50)):
+        pose = odometer.step(scan, PERIOD * number + rng.uniform(-0.02, 0.02), ANGLES)
+        assert pose.degraded == ""
+
+
+def test_memory_does_not_grow(recorder):
+    scans, odometer = random_scans(20), Odometer(recorder)
+    recorder.pairs = type("", (), {"append": lambda self, pair: None})()
+    drive(odometer, scans)
+    tracemalloc.start()
+    for round_ in range(1, 100):
+        drive(odometer, scans, first=20 * round_)
+        if round_ == 9:
+            before = tracemalloc.get_traced_memory()[0]
+    grown = tracemalloc.get_traced_memory()[0] - before
+    tracemalloc.stop()
+    assert grown < 20_000, "1,800 more scans of 724 bytes each"
+
+
+def test_unfitted_deviations_are_null_in_json():
+    odometer = Odometer(CheckpointStepper(build(fitted=False)))
+    pose = drive(odometer, random_scans(2))[1]
+    assert math.isnan(pose.distance_deviation)
+    assert pose.as_dict()["distance_deviation"] is None
+
+
+@pytest.mark.parametrize(
+    ("scan", "angles"),
+    [(np.zeros((2, 2, 2)), None), (np.ones(5), np.zeros(1)), (np.ones(5), np.zeros(6)), (3.0, None)],
+)
+def test_shapes_that_are_no_scan(recorder, scan, angles):
+    with pytest.raises(ValueError, match="a scan is ranges"):
+        Odometer(recorder).step(scan, angles=angles)
+
+
+def test_a_file_of_another_sensor_is_refused(tmp_path):
+    write(to_onnx(build(), "fp32"), tmp_path / "model.onnx")
+    assert Odometer.from_onnx(tmp_path / "model.onnx", sensor=Sensor(1.0, 180.0, 40.0))
+    with pytest.raises(InputError, match=r"made for .*180.*, not .*360"):
+        Odometer.from_onnx(tmp_path / "model.onnx", sensor=Sensor())

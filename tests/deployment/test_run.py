@@ -1,0 +1,338 @@
+"""``rcnn-odom run``: recordings and live scans through an exported network."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+from itertools import pairwise
+
+import numpy as np
+import pytest
+
+from conftest import ROOT
+from data.make_bag import FORMATS, make_bag
+from data.make_carmen import make_carmen
+from data.make_kitti import TR, make_kitti
+from odometry import SENSOR, build, random_scans
+from rcnn_odom.cli import main
+from rcnn_odom.deployment.odometer import Odometer
+from rcnn_odom.deployment.run import run
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FORWARD_CAMERA, change_frame, planar_to_poses
+from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.recordings import carmen
+from rcnn_odom.recordings.formats import Scan, ScanStream
+from rcnn_odom.recordings.trajectory import read_kitti, read_tum
+from rcnn_odom.training.onnx_graph import to_onnx, write
+
+FILES = {"trajectory.txt", "trajectory.tum", "steps.jsonl", "map.png", "summary.json"}
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory):
+    """A tiny network for a SICK laser, as a file."""
+    path = tmp_path_factory.mktemp("model") / "tiny.onnx"
+    write(to_onnx(build(), "fp32"), path)
+    return str(path)
+
+
+@pytest.fixture(scope="module")
+def velodyne(tmp_path_factory):
+    """One for a ring of 0.5 degrees."""
+    path = tmp_path_factory.mktemp("model") / "ring.onnx"
+    write(to_onnx(build(sensor=Sensor(0.5, 360.0, 80.0)), "fp32"), path)
+    return str(path)
+
+
+def steps_in(out):
+    return [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
+
+
+def test_a_carmen_log_gives_the_poses_of_the_odometer(model, tmp_path, capsys):
+    make_carmen(tmp_path, "robot", frames=30)
+    out = tmp_path / "out"
+    assert main(["run", model, str(tmp_path / "robot.log"), "--out", str(out)]) == 0
+    assert {path.name for path in out.iterdir()} == FILES
+    sequence, odometer = carmen.load("robot", root=tmp_path), Odometer.from_onnx(model)
+    expected = []
+    for frame in range(30):
+        angles, ranges = sequence.read_scan(frame)
+        expected.append(odometer.step(ranges, None, angles).matrix())
+    camera = change_frame(np.array(expected), FORWARD_CAMERA)
+    np.testing.assert_allclose(read_kitti(out / "trajectory.txt"), camera, atol=1e-9)
+    stamps, poses = read_tum(out / "trajectory.tum")
+    np.testing.assert_allclose(poses, camera, atol=1e-7)
+    np.testing.assert_allclose(stamps, sequence.stamps)
+    assert [step["stamp"] for step in steps_in(out)] == sequence.stamps.tolist()
+    summary = json.loads((out / "summary.json").read_text())
+    assert (summary["scans"], summary["degraded"], summary["skipped"]) == (30, {}, {})
+    assert 0 < summary["latency"]["median_ms"] <= summary["latency"]["p99_ms"] <= summary["latency"]["max_ms"]
+    printed = capsys.readouterr().out
+    assert "robot.log: 30 scans" in printed
+    assert "99th percentile" in printed
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+def test_bags_of_all_kinds(model, tmp_path, kind):
+    scans = random_scans(15)
+    out = tmp_path / "out"
+    assert main(["run", model, str(make_bag(tmp_path, kind, scans)), "--out", str(out)]) == 0
+    odometer = Odometer.from_onnx(model)
+    # The angles of a LaserScan are in single precision.
+    expected = [odometer.step(scan) for scan in scans.astype(np.float64)]
+    got = steps_in(out)
+    np.testing.assert_allclose([step["x"] for step in got], [pose.x for pose in expected], atol=1e-4)
+    assert not any(step["degraded"] for step in got)
+
+
+def test_a_kitti_folder_is_written_in_its_camera_frame(velodyne, tmp_path):
+    make_kitti(tmp_path, ["05"], frames=12)
+    out = tmp_path / "out"
+    assert main(["run", velodyne, str(tmp_path / "sequences" / "05"), "--out", str(out)]) == 0
+    steps = steps_in(out)
+    expected = planar_to_poses([[step["x"], step["y"], step["heading"]] for step in steps])
+    np.testing.assert_allclose(read_kitti(out / "trajectory.txt"), change_frame(expected, TR), atol=1e-9)
+    assert steps[-1]["x"] != 0
+
+
+def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
+    bag = str(make_bag(tmp_path, "mcap", random_scans(5), ("/a", "/b")))
+    out = tmp_path / "out"
+    assert main(["run", model, bag, "--out", str(out)]) == 1
+    assert "choose one with --topic: /a, /b" in capsys.readouterr().err
+    assert main(["run", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
+    assert "the model is for 360 degrees with one every 0.5" in capsys.readouterr().err
+    assert not out.exists()
+    assert main(["run", model, bag, "--out", str(out), "--topic", "/a"]) == 0
+
+
+def test_what_is_there_is_not_overwritten(model, tmp_path, capsys):
+    make_carmen(tmp_path, "robot", frames=5)
+    command = ["run", model, str(tmp_path / "robot.log"), "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    before = (tmp_path / "out" / "trajectory.txt").read_bytes()
+    assert main(command) == 1
+    assert "holds a trajectory already; choose another --out" in capsys.readouterr().err
+    assert (tmp_path / "out" / "trajectory.txt").read_bytes() == before
+    command[-1] = str(tmp_path / "robot.log" / "out")
+    assert main(command) == 1
+    assert "cannot be written" in capsys.readouterr().err
+
+
+def test_a_log_that_breaks_off_leaves_valid_files(model, tmp_path, capsys):
+    make_carmen(tmp_path, "robot", frames=80, compress="gz")
+    log = tmp_path / "robot.log.gz"
+    log.write_bytes(log.read_bytes()[:-2000])
+    out = tmp_path / "out"
+    assert main(["run", model, str(log), "--out", str(out)]) == 1
+    assert "cannot be read to its end" in capsys.readouterr().err
+    summary = json.loads((out / "summary.json").read_text())
+    assert "cannot be read to its end" in summary["stopped"]
+    count = len(read_kitti(out / "trajectory.txt"))
+    assert 0 < count < 80
+    assert count == len(read_tum(out / "trajectory.tum")[0]) == len(steps_in(out)) == summary["scans"]
+    assert (out / "map.png").exists()
+
+
+def start(*arguments, **options):
+    command = [sys.executable, "-m", "rcnn_odom.cli", *map(str, arguments)]
+    return subprocess.Popen(command, text=True, stderr=subprocess.PIPE, **options)
+
+
+def test_live_answers_each_line_at_once(model, tmp_path):
+    scans = random_scans(6).astype(np.float64)
+    process = start(
+        "run", model, "--live", "--out", tmp_path / "out", stdin=subprocess.PIPE, stdout=subprocess.PIPE
+    )
+    odometer = Odometer.from_onnx(model)
+    for number, scan in enumerate(scans):
+        line = {"stamp": 0.1 * number, "ranges": [None if value == 0 else value for value in scan]}
+        process.stdin.write(json.dumps(line) + "\n")
+        process.stdin.flush()
+        answer = json.loads(process.stdout.readline())  # it comes before the next scan is sent
+        expected = odometer.step(scan, 0.1 * number).as_dict()
+        assert answer == pytest.approx(expected)
+        process.stdin.write("this is no scan\n")
+    rest, errors = process.communicate(timeout=60)
+    assert (process.returncode, rest) == (0, "")
+    assert "standard input:2: no scan" in errors
+    assert "skipped: 6 lines that are no scan" in errors
+    assert len(steps_in(tmp_path / "out")) == 6
+
+
+def test_a_killed_run_leaves_whole_lines(model, tmp_path):
+    process = start(
+        "run", model, "--live", "--out", tmp_path / "out", stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+    )
+    line = json.dumps({"ranges": random_scans(1)[0].tolist()}) + "\n"
+    for _ in range(20):
+        process.stdin.write(line)
+    process.stdin.flush()
+    steps = tmp_path / "out" / "steps.jsonl"
+    for _ in range(600):
+        if steps.exists() and len(steps.read_text().splitlines()) >= 10:
+            break
+        time.sleep(0.1)
+    os.kill(process.pid, signal.SIGKILL)
+    process.communicate(timeout=60)
+    count = len(steps_in(tmp_path / "out"))
+    assert count >= 10
+    assert abs(len(read_kitti(tmp_path / "out" / "trajectory.txt")) - count) <= 1
+
+
+def test_bytes_that_are_no_text_are_a_line_that_is_no_scan(model):
+    good = json.dumps({"ranges": random_scans(1)[0].tolist()}).encode()
+    done = subprocess.run(
+        [sys.executable, "-m", "rcnn_odom.cli", "run", model, "--live"],
+        input=b"\n".join([good, b"\xff\xfe{", good]),
+        capture_output=True,
+        env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
+        check=True,
+    )
+    assert len(done.stdout.splitlines()) == 2
+    assert b"skipped: 1 lines that are no scan" in done.stderr
+
+
+def test_an_empty_first_scan_says_nothing_of_the_laser(model, monkeypatch, capsys):
+    good = json.dumps(
+        {"ranges": random_scans(1)[0].tolist(), "angle_min": -1.5708, "angle_increment": 0.0174533}
+    )
+    empty = json.dumps({"ranges": [], "angle_min": -1.5708, "angle_increment": 0.0174533})
+    monkeypatch.setattr(sys, "stdin", iter([empty, good]))
+    assert main(["run", model, "--live"]) == 0
+    assert len(capsys.readouterr().out.splitlines()) == 2
+
+
+def test_live_without_a_scan(model, capsys, monkeypatch):
+    monkeypatch.setattr(sys, "stdin", iter(()))
+    assert main(["run", model, "--live"]) == 1
+    assert "standard input: no scan in it" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [([], "give either INPUT or --live"), (["a", "--live"], "give either"), (["a"], "--out DIR is needed")],
+)
+def test_wrong_usage(model, arguments, message, capsys):
+    with pytest.raises(SystemExit) as stopped:
+        main(["run", model, *arguments])
+    assert stopped.value.code == 2
+    assert message in capsys.readouterr().err
+
+
+def test_models_that_are_none(tmp_path, capsys):
+    for model in ("rcnn_huge", str(tmp_path / "none.ckpt")):
+        assert main(["run", model, str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+        assert "no such" in capsys.readouterr().err
+
+
+def test_trouble_is_counted_by_kind(model, tmp_path):
+    scans = random_scans(10).astype(np.float64)
+    stamps = [0.0, 0.1, 0.2, 0.3, 0.4, 0.2, 0.5, 0.9, 1.0, 1.1]
+    angles = np.deg2rad(np.arange(181) - 90.0)
+    scans[8] = 0
+    rows = [Scan(scan, angles, stamp) for scan, stamp in zip(scans, stamps, strict=True)]
+    summary = run(Odometer.from_onnx(model), ScanStream("log", iter(rows)), "tiny", tmp_path / "out")
+    assert summary["degraded"] == {"late scan": 1, "gap": 2, "no returns": 1}
+    steps = steps_in(tmp_path / "out")
+    driven = sum(np.hypot(b["x"] - a["x"], b["y"] - a["y"]) for a, b in pairwise(steps))
+    assert summary["path_m"] == pytest.approx(driven, rel=1e-3)
+    # A late scan has a line of its own, but no place in time.
+    assert len(read_kitti(tmp_path / "out" / "trajectory.txt")) == 10
+    assert np.all(np.diff(read_tum(tmp_path / "out" / "trajectory.tum")[0]) > 0)
+
+
+def test_memory_is_constant_over_a_long_stream(model):
+    """A fifth of an hour of scans, made as they are read."""
+    import tracemalloc
+
+    scans, angles, used = random_scans(50).astype(np.float64), np.deg2rad(np.arange(181) - 90.0), []
+
+    def endless():
+        for number in range(8000):
+            if number in (4000, 7999):
+                used.append(tracemalloc.get_traced_memory()[0])
+            yield Scan(scans[number % 50], angles, 0.1 * number)
+
+    tracemalloc.start()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("rcnn_odom.deployment.run.MAP_SCANS", 100)
+        patch.setattr("rcnn_odom.deployment.run.LATENCIES", 100)
+        run(Odometer.from_onnx(model), ScanStream("long", endless()), "tiny")
+    tracemalloc.stop()
+    assert used[1] - used[0] < 200_000, used
+
+
+def test_the_map_shows_walls_where_they_are(tmp_path):
+    """With true motions the scans of a square room lie on each other."""
+    from rcnn_odom.evaluation.figures import map_figure
+
+    odometer = Odometer(_Straight())
+    points, poses = [], []
+    angles = np.deg2rad(np.arange(360) - 180.0)
+    for step in range(5):
+        x = 0.5 * step
+        with np.errstate(divide="ignore"):
+            forward = np.where(np.cos(angles) > 0, (10 - x) / np.cos(angles), (-10 - x) / np.cos(angles))
+            ranges = np.minimum(forward, np.abs(10 / np.sin(angles)))
+        pose = odometer.step(ranges, 0.1 * step, angles)
+        points.append(odometer.returns())
+        poses.append([pose.x, pose.y, pose.heading])
+    seen = np.concatenate(points)
+    assert np.abs(np.abs(seen).max(1) - 10).max() < 0.1
+    map_figure("room", np.array(poses), points).savefig(tmp_path / "map.png")
+    assert (tmp_path / "map.png").stat().st_size > 5000
+    map_figure("nothing seen", np.zeros((1, 3)), [np.empty((0, 2), np.float32)])
+
+
+class _Straight:
+    def __init__(self):
+        from rcnn_odom.deployment.odometer import Description
+
+        self.description = Description(Sensor(1.0, 360.0, 40.0), "end", (0.5, 0.1), 0.0, 0.1)
+
+    def __call__(self, pair):
+        return np.array([0.5, 0.0]), np.zeros(2)
+
+    def reset(self):
+        pass
+
+
+def test_errors_inside_are_not_hidden(model, tmp_path):
+    class Broken:
+        description = Odometer.from_onnx(model).description
+
+        def reset(self):
+            pass
+
+        def __call__(self, pair):
+            raise RuntimeError("a fault of the program")
+
+    rows = [Scan(scan, None, None) for scan in random_scans(3)]
+    with pytest.raises(RuntimeError):
+        run(Odometer(Broken()), ScanStream("log", iter(rows)), "tiny", tmp_path / "out")
+    assert len(read_kitti(tmp_path / "out" / "trajectory.txt")) == 1
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["stopped"] == "a fault of the program"
+    with pytest.raises(InputError):
+        run(Odometer.from_onnx(model), ScanStream("log", iter(())), "tiny")
+
+
+def test_encoded_points_are_decoded_to_where_they_were():
+    from rcnn_odom.models.encoding import decode
+
+    for sensor in (SENSOR, Sensor(0.5, 360.0, 80.0)):
+        depth = encode(np.deg2rad([-45.0, 0.0, 30.0]), [5.0, 6.0, 7.0], sensor)
+        expected = [[5 * np.sqrt(0.5), -5 * np.sqrt(0.5)], [6.0, 0.0], [7 * np.sqrt(0.75), 3.5]]
+        np.testing.assert_allclose(decode(depth, sensor), expected, atol=1e-6)
+    backwards = encode([np.pi], [3.0], Sensor(0.5, 360.0, 80.0))
+    np.testing.assert_allclose(decode(backwards, Sensor(0.5, 360.0, 80.0)), [[-3.0, 0.0]], atol=1e-6)
+
+
+def test_the_command_needs_no_pytorch(model, tmp_path):
+    make_carmen(tmp_path, "robot", frames=4)
+    command = ["run", model, str(tmp_path / "robot.log"), "--out", str(tmp_path / "out")]
+    forbid = "import sys; sys.modules['torch'] = None; from rcnn_odom.cli import main"
+    code = f"{forbid}; sys.exit(main({command!r}))"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

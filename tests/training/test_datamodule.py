@@ -1,0 +1,365 @@
+"""Windows, their sampler, the parts of recordings, and augmentation against a simulated room."""
+
+from itertools import pairwise
+
+import numpy as np
+import pytest
+import torch
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FORWARD_CAMERA, planar_to_poses
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.training.datamodule import (
+    OdometryDataModule,
+    Windows,
+    WindowSampler,
+    cut,
+    parse_part,
+    turn_scan,
+)
+
+torch.set_num_threads(1)
+FULL, HALF = Sensor(1.0, 360.0, 40.0), Sensor(1.0, 180.0, 40.0)
+
+WALLS = np.array([[1, 0.2, 7], [-0.3, 1, 4], [-1, -0.1, 9], [0.1, -1, 5], [0.8, 0.7, 6.5]])
+"""Rows a, b, c: the room is where a x + b y < c. It has no symmetry."""
+MIRRORED_WALLS = WALLS * [1, -1, 1]
+
+
+def look(pose, sensor, walls=WALLS):
+    """The exact depth vector at the middle of every bin, from x, y and heading."""
+    x, y, heading = pose
+    bearing = np.deg2rad(np.arange(sensor.bins) * sensor.resolution_deg - sensor.field_of_view_deg / 2)
+    speed = walls[:, :2] @ [np.cos(heading + bearing), np.sin(heading + bearing)]
+    room = walls[:, 2] - walls[:, :2] @ [x, y]
+    with np.errstate(divide="ignore"):
+        depth = np.where(speed > 1e-9, room[:, None] / speed, np.inf)
+    return depth.min(0).astype(np.float32)
+
+
+def random_planar(frames, seed=0):
+    rng = np.random.default_rng(seed)
+    return np.stack([*rng.uniform(-2, 2, (2, frames)), rng.uniform(-3, 3, frames)], axis=1)
+
+
+def encoded(planar, name="room", sensor=FULL, scans=None):
+    scans = np.stack([look(pose, sensor) for pose in planar]) if scans is None else scans
+    stamps = np.arange(len(planar), dtype=np.float64)
+    return EncodedSequence(name, f"key-{name}", scans, planar_to_poses(planar), stamps, FORWARD_CAMERA)
+
+
+def numbered(frames, first=0, name="numbered"):
+    """A drive whose scans hold their own number and whose distances are it too."""
+    numbers = np.arange(first, first + frames)
+    planar = np.stack([np.concatenate([[0], np.cumsum(numbers[:-1])]), *np.zeros((2, frames))], axis=1)
+    scans = np.repeat(numbers[:, None], FULL.bins, axis=1).astype(np.float32)
+    return encoded(planar, name, scans=scans)
+
+
+def turned_left(pose, degrees):
+    return pose[0], pose[1], pose[2] + np.deg2rad(degrees)
+
+
+def wrap(angle):
+    return np.angle(np.exp(1j * np.asarray(angle)))
+
+
+def second_pose(planar, motion):
+    """Where the second scan was taken, from the first pose, the true place and the label's turn."""
+    return [planar[1][0], planar[1][1], planar[0][2] + motion[1]]
+
+
+# --- windows -------------------------------------------------------------------------------------
+
+
+def test_window_holds_consecutive_pairs_and_their_motions():
+    sequences = [numbered(6), numbered(5, first=100)]
+    windows = Windows(sequences, FULL, length=3)
+    batch = windows.__getitems__([(2, 0, False), (6, 0, False), (7, 0, False)])
+    assert batch["pairs"].shape == (3, 3, 2, 361)
+    assert batch["motions"].shape == (3, 3, 2)
+    assert batch["pairs"].dtype == batch["motions"].dtype == torch.float32
+    first_frames = [[2, 3, 4], [100, 101, 102], [101, 102, 103]]
+    assert batch["pairs"][:, :, 0, 0].tolist() == first_frames
+    assert batch["pairs"][:, :, 1, 0].tolist() == [[n + 1 for n in row] for row in first_frames]
+    np.testing.assert_allclose(batch["motions"][..., 0], first_frames)
+    np.testing.assert_allclose(batch["motions"][..., 1], 0, atol=1e-7)
+
+
+def test_augmentation_leaves_the_recording_alone():
+    sequence = encoded(random_planar(5))
+    scans, motions = sequence.scans.copy(), sequence.motions.copy()
+    Windows([sequence], FULL, 3, max_turn_bins=20).__getitems__([(0, 1, True), (1, 2, False)])
+    np.testing.assert_array_equal(sequence.scans, scans)
+    np.testing.assert_array_equal(sequence.motions, motions)
+
+
+def drawn(lengths, window, seed=0, epoch=0, mirror=False):
+    sampler = WindowSampler(lengths, window, mirror, seed)
+    sampler.set_epoch(epoch)
+    draws = list(sampler)
+    assert len(draws) == len(sampler)
+    return draws
+
+
+@pytest.mark.parametrize("window", [1, 2, 5, 16])
+def test_window_stays_within_its_drive(window):
+    lengths = [17, 40, 33, 18, 50]
+    borders = np.cumsum([0, *lengths])
+    for epoch in range(40):
+        pairs = np.array([frame + np.arange(window) for frame, _, _ in drawn(lengths, window, epoch=epoch)])
+        drive = np.searchsorted(borders, pairs[:, 0], side="right") - 1
+        assert (pairs[:, -1] + 1 < borders[drive + 1]).all()
+        # Nothing twice in an epoch, and every drive at least once.
+        assert len(np.unique(pairs)) == pairs.size
+        assert set(drive) == set(range(5))
+
+
+@pytest.mark.parametrize("window", [1, 2, 5, 16])
+@pytest.mark.parametrize("frames", [17, 31, 32, 33, 40, 47, 63])
+def test_every_pair_is_trained_on_in_some_epoch(window, frames):
+    seen = set()
+    for epoch in range(400):
+        for frame, _, _ in drawn([frames], window, epoch=epoch):
+            seen |= set(range(frame, frame + window))
+    assert seen == set(range(frames - 1))
+
+
+def test_single_pairs_are_all_drawn_in_every_epoch():
+    frames = sorted(frame for frame, _, _ in drawn([4, 3], 1))
+    assert frames == [0, 1, 2, 4, 5]
+
+
+def test_epoch_is_the_same_however_it_was_reached():
+    sampler = WindowSampler([50, 60], 4, True, seed=3)
+    list(sampler)
+    sampler.set_epoch(1)
+    list(sampler)
+    sampler.set_epoch(2)
+    assert list(sampler) == drawn([50, 60], 4, seed=3, epoch=2, mirror=True)
+
+
+def test_epochs_and_seeds_differ():
+    lengths = [50, 60]
+    orders = [drawn(lengths, 4, seed, epoch) for seed, epoch in ((0, 0), (0, 1), (1, 0), (0, 2))]
+    frames = [tuple(frame for frame, _, _ in order) for order in orders]
+    assert len(set(frames)) == 4
+    assert len({tuple(sorted(order)) for order in frames}) > 1
+    assert list(frames[0]) != sorted(frames[0])
+
+
+def test_half_of_the_windows_are_mirrored_if_asked_for():
+    assert not any(mirror for _, _, mirror in drawn([2000], 1))
+    assert 0.4 < np.mean([mirror for _, _, mirror in drawn([2000], 1, mirror=True)]) < 0.6
+
+
+# --- augmentation --------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("bins", [0, 1, -1, 7, -30, 90, 180, -180])
+def test_turned_scan_is_what_a_turned_laser_sees(bins):
+    pose = np.array([0.5, -1.2, 0.3])
+    turned = turn_scan(look(pose, FULL), bins, FULL)
+    np.testing.assert_allclose(turned, look(turned_left(pose, bins), FULL), rtol=1e-5)
+    assert turned[0] == turned[-1]
+
+
+@pytest.mark.parametrize("bins", [0, 1, -1, 7, -30, 90, -90, 180, -180, 181, -181, 200, -200])
+def test_turned_half_circle_is_empty_where_nothing_was_seen(bins):
+    pose = np.array([0.5, -1.2, 0.3])
+    turned = turn_scan(look(pose, HALF), bins, HALF)
+    bearing = np.arange(181) - 90 + bins
+    expected = np.where(np.abs(bearing) <= 90, look(turned_left(pose, bins), HALF), 0)
+    np.testing.assert_allclose(turned, expected, rtol=1e-5)
+
+
+def test_turned_window_has_exact_labels():
+    planar = random_planar(9)
+    sequence = encoded(planar)
+    batch = Windows([sequence], FULL, 8, max_turn_bins=25).__getitems__([(0, 5, False)])
+    pairs, motions = batch["pairs"][0].numpy(), batch["motions"][0].numpy().astype(np.float64)
+    for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True)):
+        np.testing.assert_allclose(pair[0], look(planar[number], FULL), rtol=1e-5)
+        pose = second_pose(planar[number : number + 2], motion)
+        np.testing.assert_allclose(pair[1], look(pose, FULL), rtol=1e-4)
+    turns = np.rad2deg(wrap(motions[:, 1] - sequence.motions[:, 1]))
+    np.testing.assert_allclose(turns, turns.round(), atol=1e-4)
+    assert len(set(turns.round())) > 3
+    assert np.abs(turns).max() < 25.5
+    np.testing.assert_allclose(motions[:, 0], sequence.motions[:, 0], rtol=1e-6)
+
+
+@pytest.mark.parametrize("sensor", [FULL, HALF])
+def test_mirrored_window_is_a_drive_through_the_mirrored_room(sensor):
+    planar = random_planar(6)
+    mirrored = planar * [1, -1, -1]
+    batch = Windows([encoded(planar, sensor=sensor)], sensor, 5).__getitems__([(0, 0, True)])
+    pairs, motions = batch["pairs"][0].numpy(), batch["motions"][0].numpy()
+    for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True)):
+        before, after = mirrored[number : number + 2]
+        np.testing.assert_allclose(pair[0], look(before, sensor, MIRRORED_WALLS), rtol=1e-4)
+        np.testing.assert_allclose(pair[1], look(after, sensor, MIRRORED_WALLS), rtol=1e-4)
+        step = (after[:2] - before[:2]) @ [np.cos(before[2]), np.sin(before[2])]
+        distance = np.sign(step) * np.hypot(*(after[:2] - before[:2]))
+        np.testing.assert_allclose(motion, [distance, wrap(after[2] - before[2])], atol=1e-5)
+
+
+def test_turned_and_mirrored_window_has_exact_labels():
+    planar = random_planar(4)
+    batch = Windows([encoded(planar)], FULL, 3, max_turn_bins=25).__getitems__([(0, 5, True)])
+    mirrored = planar * [1, -1, -1]
+    for number in range(3):
+        motion = batch["motions"][0, number].numpy().astype(np.float64)
+        pose = second_pose(mirrored[number : number + 2], motion)
+        expected = look(pose, FULL, MIRRORED_WALLS)
+        np.testing.assert_allclose(batch["pairs"][0, number, 1], expected, rtol=1e-4)
+
+
+# --- parts and the unknown truth -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("05", ("05", 0.0, 1.0)),
+        ("mit-killian[:0.85]", ("mit-killian", 0.0, 0.85)),
+        ("mit-killian[0.85:]", ("mit-killian", 0.85, 1.0)),
+        ("a b[0.25:0.5]", ("a b", 0.25, 0.5)),
+        ("x[:]", ("x", 0.0, 1.0)),
+    ],
+)
+def test_part_is_named_by_fractions(text, expected):
+    assert parse_part(text) == expected
+
+
+@pytest.mark.parametrize(
+    "text", ["x[0.5]", "x[1:2]", "x[0.5:0.5]", "x[0.6:0.5]", "x[a:b]", "x[-0.1:1]", "x[.:1]", "x[:0]"]
+)
+def test_wrong_part_is_refused(text):
+    with pytest.raises(InputError, match="sequence"):
+        parse_part(text)
+
+
+def test_parts_do_not_overlap_and_leave_nothing_out():
+    whole = numbered(41)
+    head, tail = (cut({"x": whole}, name) for name in ("x[:0.85]", "x[0.85:]"))
+    assert (head.name, tail.name) == ("x[:0.85]", "x[0.85:]")
+    np.testing.assert_array_equal(np.concatenate([head.scans, tail.scans]), whole.scans)
+    assert len(head) == round(0.85 * 41)
+
+
+def with_unknown(sequence, *frames):
+    sequence.poses[list(frames)] = np.nan
+    return sequence
+
+
+def test_unknown_truth_at_the_ends_is_cut():
+    part = cut({"x": with_unknown(numbered(10), 0, 1, 9)}, "x")
+    assert part.scans[:, 0].tolist() == [2, 3, 4, 5, 6, 7, 8]
+    assert np.isfinite(part.motions).all()
+
+
+def test_unknown_truth_inside_is_refused_and_named():
+    with pytest.raises(InputError, match="frame 4"):
+        cut({"x": with_unknown(numbered(10), 0, 4, 5)}, "x")
+    assert len(cut({"x": with_unknown(numbered(10), 4)}, "x[0.5:]")) == 5
+
+
+@pytest.mark.parametrize("known", [0, 1])
+def test_fewer_than_two_known_poses_are_refused(known):
+    with pytest.raises(InputError, match="two are needed"):
+        cut({"x": with_unknown(numbered(5), *range(known, 5))}, "x")
+
+
+# --- the module ----------------------------------------------------------------------------------
+
+
+def read_room(name):
+    """A drive that looks at the room from the middle of every bin."""
+    frames = {"long": 40, "short": 5}[name]
+    planar = random_planar(frames, seed=frames)
+    angles = np.deg2rad(np.arange(-180.0, 180.0))
+    # A method of a list: the workers that encode need not import this file, and with it torch.
+    read_scan = [(angles, look(pose, FULL)[:-1].astype(np.float64)) for pose in planar].__getitem__
+    stamps = np.arange(frames, dtype=np.float64)
+    return Sequence(name, planar_to_poses(planar), stamps, read_scan, fingerprint=name)
+
+
+@pytest.fixture(scope="module")
+def cache(tmp_path_factory):
+    return tmp_path_factory.mktemp("cache")
+
+
+def room_module(cache, train=("long",), val=("short",), test=("long[0.5:]", "short"), **options):
+    options = {"workers": 1, **options}
+    return OdometryDataModule(read_room, list(train), list(val), list(test), FULL, cache, **options)
+
+
+def test_module_reads_encodes_and_cuts(cache):
+    module = room_module(cache).load()
+    assert [len(s) for split in ("train", "val", "test") for s in module.sequences[split]] == [40, 5, 20, 5]
+    planar = random_planar(40, seed=40)
+    expected = np.stack([look(pose, FULL) for pose in planar])
+    np.testing.assert_allclose(module.sequences["train"][0].scans, expected, rtol=1e-5)
+    np.testing.assert_allclose(module.sequences["test"][0].scans, expected[20:], rtol=1e-5)
+
+
+def test_validation_and_test_are_whole_drives_in_order(cache):
+    module = room_module(cache, val=("short", "long[:0.5]")).load()
+    for split, loader in (("val", module.val_dataloader()), ("test", module.test_dataloader())):
+        items = list(loader)
+        assert [item["number"] for item in items] == [0, 1]
+        for item, sequence in zip(items, module.sequences[split], strict=True):
+            np.testing.assert_array_equal(item["scans"], sequence.scans)
+
+
+def test_training_batches_have_the_asked_shape(cache):
+    module = room_module(cache, window=4, batch_size=3).load()
+    batches = list(module.train_dataloader())
+    assert len(batches) == (40 // 4 - 1) // 3
+    assert all(batch["pairs"].shape == (3, 4, 2, 361) for batch in batches)
+    assert len(list(room_module(cache, batch_size=1000).load().train_dataloader())) == 1
+
+
+def test_turn_is_asked_for_in_degrees(cache):
+    sensor = Sensor(0.5, 360.0, 40.0)
+    module = OdometryDataModule(read_room, [], [], [], sensor, cache, max_turn_deg=3.0)
+    assert module.max_turn_bins == 6
+
+
+def test_motion_statistics_are_those_of_the_training_drives(cache):
+    module = room_module(cache, train=("short", "long[:0.25]")).load()
+    rows = []
+    for planar in (random_planar(5, seed=5), random_planar(40, seed=40)[:10]):
+        for (x, y, heading), (next_x, next_y, next_heading) in pairwise(planar):
+            dx, dy = next_x - x, next_y - y
+            forward = dx * np.cos(heading) + dy * np.sin(heading)
+            rows.append((np.copysign(np.hypot(dx, dy), forward), wrap(next_heading - heading)))
+    mean, deviation = module.motion_statistics()
+    np.testing.assert_allclose(mean, np.mean(rows, axis=0), atol=1e-9)
+    np.testing.assert_allclose(deviation, np.std(rows, axis=0), atol=1e-9)
+
+
+def test_deviation_of_constant_motion_is_not_zero():
+    module = room_module("unused")
+    module.sequences["train"] = [encoded(np.stack([np.arange(5.0), *np.zeros((2, 5))], axis=1))]
+    assert (module.motion_statistics()[1] > 0).all()
+
+
+def test_window_longer_than_a_training_drive_is_refused(cache):
+    with pytest.raises(InputError, match="short has 5 frames, a window needs 6"):
+        room_module(cache, train=("long", "short"), window=5).load()
+    assert len(room_module(cache, train=("short",), window=4).load().train_dataloader()) == 1
+
+
+@pytest.mark.parametrize("split", ["train", "val", "test"])
+def test_empty_split_is_refused(cache, split):
+    with pytest.raises(InputError, match=rf"data\.{split}"):
+        room_module(cache, **{split: ()}).load()
+
+
+def test_other_splits_need_not_be_given(cache):
+    module = room_module(cache, train=(), val=()).load(("test",))
+    assert list(module.sequences) == ["test"]

@@ -1,0 +1,341 @@
+"""The four variants: training, estimating whole drives, checkpoints."""
+
+import io
+import os
+import pickle
+
+import lightning as L
+import numpy as np
+import pytest
+import torch
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FORWARD_CAMERA, compose
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.training.checkpoint import load_module
+from rcnn_odom.training.datamodule import OdometryDataModule, Windows
+from rcnn_odom.training.modules import VARIANTS, CNNClassification
+
+torch.set_num_threads(1)
+NAMES = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
+SENSOR = Sensor(1.0, 180.0, 40.0)
+SCORING = {"lengths": [5.0, 10.0], "apply": "end"}
+MEAN, DEVIATION = np.array([0.5, 0.01]), np.array([0.2, 0.03])
+
+
+def settings(variant, **changes):
+    model = {
+        "variant": variant,
+        "kernel_size": 3,
+        "pooling": "avg",
+        "angle": "expectation",
+        "dropout": 0.0,
+        "rotation_classes": {"count": 112, "width_deg": 0.1},
+        "beta": 1.0 if variant.endswith("cls") else 100.0,
+        "per_sample_norm": False,
+        "epochs": 2,
+        "learning_rate": 1e-3,
+        "window": 1,
+        "batch_size": 8,
+    }
+    if variant.startswith("rcnn"):
+        model |= {"hidden_size": 12, "layers": 2, "projection": None, "freeze": False}
+        model |= {"window": 5, "batch_size": 4}
+    return {**model, **changes}
+
+
+def build(variant, seed=0, sensor=SENSOR, **changes):
+    torch.manual_seed(seed)
+    module = VARIANTS[variant](settings(variant, **changes), sensor.as_dict(), SCORING)
+    module.set_motion_statistics(MEAN, DEVIATION)
+    return module
+
+
+def random_scans(frames, seed=0):
+    return torch.from_numpy(np.random.default_rng(seed).uniform(0, 40, (frames, 181)).astype(np.float32))
+
+
+def small_data(module, frames=60):
+    rng = np.random.default_rng(0)
+
+    def sequence(name):
+        motions = np.stack([rng.normal(0.5, 0.2, frames - 1), rng.normal(0.01, 0.03, frames - 1)], axis=1)
+        scans = rng.uniform(0, 40, (frames, 181)).astype(np.float32)
+        return EncodedSequence(name, name, scans, compose(motions), np.arange(float(frames)), FORWARD_CAMERA)
+
+    model = module.model
+    data = OdometryDataModule(
+        None, ["a"], ["b"], ["c"], SENSOR, "unused", window=model["window"], batch_size=model["batch_size"]
+    )
+    data.sequences = {split: [sequence(split)] for split in ("train", "val", "test")}
+    return data
+
+
+def small_trainer(epochs=2):
+    return L.Trainer(
+        accelerator="cpu",
+        max_epochs=epochs,
+        logger=False,
+        enable_checkpointing=False,
+        enable_progress_bar=False,
+        enable_model_summary=False,
+        num_sanity_val_steps=0,
+        gradient_clip_val=1.0,
+    )
+
+
+def save(module, path, **changes):
+    """A checkpoint as Lightning writes it."""
+    trainer = small_trainer()
+    trainer.strategy.connect(module)
+    trainer.save_checkpoint(path, weights_only=True)
+    if changes:
+        torch.save({**torch.load(path, weights_only=True), **changes}, path)
+    return path
+
+
+# --- training ------------------------------------------------------------------------------------
+
+
+class Record(L.Callback):
+    def __init__(self):
+        self.losses = []
+
+    def on_train_batch_end(self, trainer, module, outputs, batch, batch_idx):
+        self.losses.append(outputs["loss"].item())
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("variant", NAMES)
+@pytest.mark.parametrize("per_sample_norm", [False, True])
+def test_training_learns_from_finite_losses(variant, per_sample_norm):
+    module = build(variant, per_sample_norm=per_sample_norm)
+    before = {name: value.clone() for name, value in module.named_parameters()}
+    data, trainer, record = small_data(module), small_trainer(), Record()
+    trainer.callbacks.append(record)
+    trainer.fit(module, datamodule=data)
+    assert len(record.losses) == 2 * len(data.train_dataloader())
+    assert np.isfinite(record.losses).all()
+    for name, value in module.named_parameters():
+        assert value.isfinite().all()
+        assert not torch.equal(value, before[name]), name
+    assert np.isfinite(float(trainer.callback_metrics["val/drift"]))
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_loss_is_that_of_the_paper(variant):
+    module = build(variant)
+    rng = np.random.default_rng(1)
+    pairs = rng.uniform(0, 40, (3, 5, 2, 181)).astype(np.float32)
+    truth = rng.normal([0.5, 0.0], [0.2, 0.08], (3, 5, 2)).astype(np.float32)
+    batch = {"pairs": torch.from_numpy(pairs), "motions": torch.from_numpy(truth), "frames": torch.arange(3)}
+    outputs = module.training_step(batch, 0)
+    with torch.no_grad():
+        estimate, _ = module.network(torch.from_numpy(pairs))
+    error = estimate.motion.numpy().astype(np.float64) - truth
+    distance, rotation = np.sqrt((error**2).mean((0, 1)))
+    if variant.endswith("cls"):
+        scores = estimate.scores.numpy().astype(np.float64)
+        share = np.exp(scores) / np.exp(scores).sum(-1, keepdims=True)
+        number = np.clip(np.floor(np.degrees(truth[..., 1].astype(np.float64)) / 0.1) + 56, 0, 111).astype(
+            int
+        )
+        rotation = -np.log(np.take_along_axis(share, number[..., None], -1)).mean()
+        outside = (np.abs(np.degrees(truth[..., 1])) > 5.6).mean()
+        assert outputs["headings_outside_classes"].item() == pytest.approx(outside)
+    expected = distance + (1 if variant.endswith("cls") else 100) * rotation
+    assert outputs["loss"].item() == pytest.approx(expected, rel=1e-5)
+
+
+@pytest.mark.filterwarnings("ignore")
+def test_every_epoch_draws_other_windows(monkeypatch):
+    draws = []
+    original = Windows.__getitems__
+
+    def spy(self, batch):
+        draws.append([frame for frame, _, _ in batch])
+        return original(self, batch)
+
+    monkeypatch.setattr(Windows, "__getitems__", spy)
+    module = build("cnn_reg")
+    data = small_data(module)
+    small_trainer().fit(module, datamodule=data)
+    half = len(data.train_dataloader())
+    assert len(draws) == 2 * half
+    assert draws[:half] != draws[half:]
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("freeze", [False, True])
+def test_first_stage_is_taken_over_and_frozen_if_asked_for(freeze):
+    cnn, module = build("cnn_cls", seed=5), build("rcnn_reg", seed=6, freeze=freeze)
+    assert isinstance(cnn, CNNClassification)
+    cnn.set_motion_statistics(MEAN + 1, DEVIATION * 2)
+    module.load_first_stage(cnn)
+    scans = random_scans(9)
+    pairs = torch.stack([scans[:-1], scans[1:]], 1)[None]
+    torch.testing.assert_close(module.network.cnn(pairs)[0].motion, cnn.network(pairs)[0].motion)
+    small_trainer(1).fit(module, datamodule=small_data(module))
+    same = [torch.equal(a, b) for a, b in zip(module.network.cnn.parameters(), cnn.parameters(), strict=True)]
+    assert all(same) if freeze else not any(same)
+
+
+# --- estimating ----------------------------------------------------------------------------------
+
+
+def in_one_pass(module, scans):
+    with torch.no_grad():
+        estimate, _ = module.network(torch.stack([scans[:-1], scans[1:]], 1)[None])
+    return estimate.motion[0].double().numpy()
+
+
+@pytest.mark.parametrize("variant", NAMES)
+@pytest.mark.parametrize("frames", [2, 64, 65, 66, 129, 155])
+def test_estimate_equals_a_single_pass(variant, frames):
+    module, scans = build(variant).eval(), random_scans(frames)
+    motions = module.estimate(scans).motions
+    assert motions.shape == (frames - 1, 2)
+    assert motions.dtype == np.float64
+    np.testing.assert_allclose(motions, in_one_pass(module, scans), atol=1e-5)
+
+
+@pytest.mark.parametrize("variant", ["rcnn_reg", "rcnn_cls"])
+def test_lstm_remembers_across_the_chunk_border(variant):
+    module, scans = build(variant).eval(), random_scans(155)
+    whole = module.estimate(scans).motions
+    # The second chunk begins with frame 64: alone it would know nothing of those before.
+    alone = module.estimate(scans[64:]).motions
+    assert np.abs(alone[0] - whole[64]).max() > 1e-4
+    changed = scans.clone()
+    changed[60] = 0
+    assert np.abs(module.estimate(changed).motions[64:66] - whole[64:66]).max() > 1e-6
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_estimate_has_no_memory_between_drives(variant):
+    module, scans = build(variant).eval(), random_scans(20)
+    first = module.estimate(scans).motions
+    module.estimate(random_scans(30, seed=1))
+    np.testing.assert_array_equal(module.estimate(scans).motions, first)
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_training_mode_and_autocast_do_not_change_estimates(variant):
+    module, scans = build(variant), random_scans(70)
+    expected = module.eval().estimate(scans).motions
+    np.testing.assert_array_equal(module.train().estimate(scans).motions, expected)
+    with torch.autocast("cpu", torch.bfloat16):
+        np.testing.assert_array_equal(module.estimate(scans).motions, expected)
+
+
+@pytest.mark.filterwarnings("ignore")
+@pytest.mark.parametrize("variant", NAMES)
+def test_trainers_test_gives_the_estimates_of_each_drive(variant):
+    module = build(variant)
+    data = small_data(module)
+    small_trainer().test(module, datamodule=data, verbose=False)
+    expected = in_one_pass(module, torch.from_numpy(data.sequences["test"][0].scans))
+    np.testing.assert_allclose(module.estimates[0].motions, expected, atol=1e-5)
+
+
+# --- checkpoints ---------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_checkpoint_gives_the_same_estimates(tmp_path, variant):
+    module, scans = build(variant), random_scans(70)
+    path = save(module, tmp_path / "best.ckpt")
+    loaded = load_module(path, variant, SENSOR)
+    assert type(loaded) is VARIANTS[variant]
+    assert not loaded.training
+    assert loaded.model == module.model
+    assert loaded.scoring == SCORING
+    np.testing.assert_array_equal(loaded.estimate(scans).motions, module.eval().estimate(scans).motions)
+
+
+def test_checkpoint_holds_plain_values_only(tmp_path):
+    saved = torch.load(save(build("rcnn_cls"), tmp_path / "best.ckpt"), weights_only=True)
+    assert saved["hyper_parameters"]["variant"] == "rcnn_cls"
+    assert saved["hyper_parameters"]["sensor"] == SENSOR.as_dict()
+
+
+def test_other_variant_is_refused(tmp_path):
+    path = save(build("cnn_reg"), tmp_path / "best.ckpt")
+    with pytest.raises(InputError, match=r"best\.ckpt: a checkpoint of cnn_reg, but cnn_cls is needed"):
+        load_module(path, "cnn_cls")
+
+
+def test_other_sensor_is_refused(tmp_path):
+    path = save(build("cnn_reg"), tmp_path / "best.ckpt")
+    with pytest.raises(InputError, match=r"best\.ckpt: trained for .*180.*360"):
+        load_module(path, sensor=Sensor())
+
+
+class Evil:
+    """Unpickled without care, makes a folder."""
+
+    def __init__(self, folder):
+        self.folder = folder
+
+    def __reduce__(self):
+        return os.mkdir, (self.folder,)
+
+
+@pytest.mark.parametrize("place", ["pickle", "whole", "hyper_parameters", "state_dict"])
+def test_code_in_a_checkpoint_is_not_run(tmp_path, place):
+    made, path = str(tmp_path / "made"), tmp_path / "evil.ckpt"
+    if place == "pickle":
+        path.write_bytes(pickle.dumps(Evil(made), protocol=2))
+    elif place == "whole":
+        torch.save(Evil(made), path)
+    else:
+        saved = torch.load(save(build("cnn_reg"), path), weights_only=True)
+        saved[place]["extra"] = Evil(made)
+        torch.save(saved, path)
+    with pytest.raises(InputError, match=r"evil\.ckpt: not a checkpoint"):
+        load_module(path)
+    assert not os.path.exists(made)
+
+
+def stored(content):
+    buffer = io.BytesIO()
+    torch.save(content, buffer)
+    return buffer.getvalue()
+
+
+GARBAGE = {
+    "empty": b"",
+    "text": b"this is not a checkpoint\n",
+    "stop": b".",
+    "zeros": bytes(100),
+    "truncated": stored({"state_dict": torch.zeros(1000)})[:700],
+    "number": stored(5),
+    "tensor": stored(torch.zeros(3)),
+    "list": stored([1, 2]),
+    "no-variant": stored({"hyper_parameters": {}, "state_dict": {}}),
+    "no-hyper-parameters": stored({"state_dict": {}}),
+    "unknown-variant": stored({"hyper_parameters": {"variant": "resnet"}, "state_dict": {}}),
+    "no-settings": stored({"hyper_parameters": {"variant": "cnn_reg"}, "state_dict": {}}),
+}
+
+
+@pytest.mark.parametrize("content", GARBAGE.values(), ids=GARBAGE.keys())
+def test_garbage_is_refused(tmp_path, content):
+    path = tmp_path / "garbage.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(InputError, match=r"garbage\.ckpt"):
+        load_module(path)
+
+
+def test_missing_weights_are_refused(tmp_path):
+    path = save(build("cnn_reg"), tmp_path / "best.ckpt", state_dict={})
+    with pytest.raises(InputError, match=r"best\.ckpt"):
+        load_module(path)
+
+
+def test_missing_file_and_folder_are_refused(tmp_path):
+    with pytest.raises(InputError, match="no such checkpoint"):
+        load_module(tmp_path / "absent.ckpt")
+    with pytest.raises(InputError, match="not a checkpoint"):
+        load_module(tmp_path)
