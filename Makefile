@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test fuzz lint bench bench-train install
+.PHONY: train test test-all coverage fuzz lint bench bench-train install
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
@@ -13,8 +13,18 @@ install: .venv/installed
 train: install
 	$(BIN)/python train.py model=rcnn_reg
 
+# One thread for each of two processes.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2
+
 test: install
-	$(BIN)/pytest
+	$(PYTEST) -m "not slow"
+
+test-all: install
+	$(PYTEST)
+
+coverage: install
+	$(PYTEST) -m "not slow" --cov --cov-report=
+	$(BIN)/coverage report --skip-covered --sort=cover
 
 fuzz: install
 	$(BIN)/pytest tests/test_fuzz.py --hypothesis-profile=long
@@ -29,3 +39,4 @@ lint: install
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports

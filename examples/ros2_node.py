@@ -5,16 +5,20 @@
 
 Parameters: model (rcnn_small, an exported .onnx or a .ckpt), odom_frame (odom). Publishes /odom: the pose of
 the laser where its first scan is the origin, and as twist the last step over its time with the network's
-variances. No TF is sent, since a robot's laser has a parent already. What an estimate suffers from (gaps, few
-returns) is logged as a warning; a late scan is not published. The file can be imported without ROS.
+covariance. No TF is sent, since a robot's laser has a parent already. What an estimate suffers from (gaps,
+few returns) is logged as a warning; a late scan is not published. The file can be imported without ROS.
 """
 
 import math
 from contextlib import suppress
+from itertools import product
 
 from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
-from rcnn_odom.recordings.formats import Scan, ScanStream, need_fitting_scan
+from rcnn_odom.recordings.formats import need_fitting_scan
 from rcnn_odom.recordings.rosbag import convert
+from rcnn_odom.recordings.stream import ScanStream
+
+AXES = (0, 1, 5)  # x, y and yaw among the six of a twist's covariance
 
 
 def fill(message, pose: Pose, seconds: float) -> None:
@@ -23,11 +27,12 @@ def fill(message, pose: Pose, seconds: float) -> None:
     message.pose.pose.orientation.z = math.sin(pose.heading / 2)
     message.pose.pose.orientation.w = math.cos(pose.heading / 2)
     if seconds > 0:
-        message.twist.twist.linear.x = pose.distance / seconds
-        message.twist.twist.angular.z = pose.turn / seconds
-        if not math.isnan(pose.distance_deviation):
-            message.twist.covariance[0] = (pose.distance_deviation / seconds) ** 2
-            message.twist.covariance[35] = (pose.turn_deviation / seconds) ** 2
+        step, twist = pose.step, message.twist.twist
+        twist.linear.x, twist.linear.y = step.x / seconds, step.y / seconds
+        twist.angular.z = step.heading / seconds
+        for i, j in product(range(3), repeat=2):  # unknown ones stay 0
+            if not math.isnan(step.covariance[i, j]):
+                message.twist.covariance[6 * AXES[i] + AXES[j]] = step.covariance[i, j] / seconds**2
 
 
 def main() -> None:
@@ -41,15 +46,20 @@ def main() -> None:
     node = rclpy.create_node("rcnn_odom")
     model = node.declare_parameter("model", "rcnn_small").value
     frame = node.declare_parameter("odom_frame", "odom").value
-    odometer = (Odometer.from_checkpoint if model.endswith(".ckpt") else Odometer.from_onnx)(model)
+    if model.endswith(".ckpt"):
+        from rcnn_odom.training.export import load_odometer
+
+        odometer = load_odometer(model, threads=1)
+    else:
+        odometer = Odometer.from_onnx(model)
     publisher, last, fits = node.create_publisher(Odometry, "odom", 10), [], []
 
     def on_scan(message) -> None:
-        scan: Scan = convert(message, node.get_clock().now().nanoseconds)
+        scan = convert(message, node.get_clock().now().nanoseconds)
         if not fits and (scan.ranges > 0).any():  # raises InputError where the laser is not the model's
             need_fitting_scan(ScanStream("scan", iter(())), scan, odometer.description.sensor)
             fits.append(True)
-        pose = odometer.step(scan.ranges, scan.stamp, scan.angles)
+        pose = odometer.step(scan)
         if pose.degraded:
             node.get_logger().warning(pose.degraded)
         if pose.degraded.startswith(LATE):

@@ -1,4 +1,7 @@
-"""A generator of drives that costs nothing; workers import it, and with it little else."""
+"""A generator of drives that costs nothing; workers import it, and with it little else.
+
+It is a recording format by the entry point in the folder ``stub_drives-1.0.dist-info``.
+"""
 
 import time
 from dataclasses import dataclass
@@ -8,7 +11,8 @@ import numpy as np
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import planar_to_poses
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.scan import Scan
 
 FRAMES = {"00": 150, "02": 70, "10": 40, "05": 40}
 
@@ -27,10 +31,11 @@ class Scans:
             raise InputError(f"{self.name}: frame 20 is damaged; copy it again")
         time.sleep(self.seconds)
         rng = np.random.default_rng([self.seed, crc32(self.name.encode()), frame])
-        return rng.uniform(-np.pi, np.pi, 100), rng.uniform(0, 50, 100)
+        bearings = rng.uniform(-np.pi, np.pi, 100)
+        return Scan(rng.uniform(0, 50, 100), bearings)
 
 
-def read(name, seed=0, broken="", seconds=0.0, frames=None, **options):
+def load(name, seed=0, broken="", seconds=0.0, frames=None, **options):
     """A drive for any name, as ``rcnn_odom.recordings.simulated.load``; ``NAME~K`` is as long as NAME."""
     frames = frames or FRAMES[name.split("~")[0]]
     steps = np.random.default_rng([seed, crc32(name.encode())]).uniform(
@@ -42,4 +47,4 @@ def read(name, seed=0, broken="", seconds=0.0, frames=None, **options):
     )
     stamps = np.arange(frames, dtype=np.float64)
     scans = Scans(name, seed, broken, seconds)
-    return Sequence(name, planar_to_poses(planar), stamps, scans, fingerprint=f"{name} {seed} {frames}")
+    return Recording(name, planar_to_poses(planar), stamps, scans, fingerprint=f"{name} {seed} {frames}")

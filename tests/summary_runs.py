@@ -46,7 +46,13 @@ def method(drifts, frame=0.05, floor=0.004):
         error = frame * int(name)
         sequences[name] = {
             "frames": FRAMES[name],
-            "drift": {"t_err": drift, "r_err_deg_per_m": drift / 10, "t_rmse": 2 * drift, "segments": 40},
+            "drift": {
+                **{"t_err": drift, "r_err_deg_per_m": drift / 10, "t_rmse": 2 * drift, "segments": 40},
+                "per_length": {
+                    f"{length:g}": {"segments": 12, "t_err": drift, "r_err_deg_per_m": drift / 10}
+                    for length in LENGTHS
+                },
+            },
             "floor": {"t_err": floor, "r_err_deg_per_m": 0.001, "t_rmse": floor, "segments": 40},
             "distance_mae_m": error,
             "distance_bias_m": -error / 2,
@@ -55,12 +61,25 @@ def method(drifts, frame=0.05, floor=0.004):
             "heading_bias_deg": error,
             "heading_max_deg": 6 * error,
         }
+    drift = float(np.mean(list(drifts.values())))
+    frames = [FRAMES[name] - 1 for name in drifts]
+    mean, largest = np.average([frame * int(name) for name in drifts], weights=frames), frame * 7
     return {
-        "drift": float(np.mean(list(drifts.values()))),
+        "drift": drift,
         "floor": floor,
         "lengths": LENGTHS,
+        "metrics": {
+            **{"drift": drift, "rotation_deg_per_m": drift / 10},
+            **{"distance_mae_m": mean, "distance_bias_m": -mean / 2, "distance_max_m": 3 * largest},
+            **{"heading_mae_deg": 2 * mean, "heading_bias_deg": mean, "heading_max_deg": 6 * largest},
+        },
         "sequences": sequences,
     }
+
+
+def older(report):
+    """The same as version 0.1 wrote it."""
+    return {key: value for key, value in report.items() if key != "metrics"}
 
 
 def metrics_of(settings, drifts, **changes):

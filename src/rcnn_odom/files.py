@@ -1,13 +1,41 @@
-"""Work that several processes want done, and one of them should do."""
+"""Files that are whole or not there, and locks that end with their process."""
 
 import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
+import os
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
+from typing import IO
 
 from filelock import FileLock, Timeout
 
 log = logging.getLogger(__name__)
+
+
+def write_atomically(path: Path, write: bytes | str | Callable[[IO[bytes]], object]) -> None:
+    """Writes a file at once or not at all: what was there before stays until all is on the disk.
+
+    Args:
+        path: of the file; its folder is made where missing.
+        write: the content, or a function that writes it into an open file.
+
+    Raises:
+        OSError: it cannot be written; nothing is left behind.
+    """
+    path.parent.mkdir(parents=True, exist_ok=True)
+    partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
+    try:
+        with partial.open("wb") as file:
+            if callable(write):
+                write(file)
+            else:
+                file.write(write.encode() if isinstance(write, str) else write)
+            file.flush()
+            os.fsync(file.fileno())
+        partial.replace(path)
+    finally:
+        with suppress(OSError):
+            partial.unlink(missing_ok=True)
 
 
 @contextmanager
@@ -36,7 +64,7 @@ def one_at_a_time(folder: Path, work: str, what: str) -> Iterator[None]:
 
 
 @contextmanager
-def held(path: Path) -> Iterator[bool]:
+def lock_if_free(path: Path) -> Iterator[bool]:
     """Holds a lock if no other process does, which is the value; the lock ends with its process."""
     lock = FileLock(path)
     try:

@@ -1,25 +1,75 @@
-"""Planar motion: relative motions out of poses, and poses out of relative motions (paper eq. 2).
+"""Planar geometry: poses, the steps between them, and poses composed of steps (paper eq. 2).
 
-A *pose* is a 4x4 matrix from the laser's frame (x forward, y left, z up) to a fixed frame.
-A *motion* is the pair (distance, heading change) from scan t-1 to scan t in metres and radians:
-all that the networks estimate.
+A *pose* is a 4x4 matrix from the laser's frame (x forward, y left, z up) to a fixed frame. A *step* is where
+the laser is at one scan, seen from where it was at the scan before: x and y in metres and the heading in
+radians, counter-clockwise. Every estimator gives steps, and everything that scores or draws knows them only.
 """
 
-from typing import Literal
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
 
 FloatArray = npt.NDArray[np.float64]
-ApplyStep = Literal["start", "middle", "end"]
-
-STEP_FRACTION = {"start": 0.0, "middle": 0.5, "end": 1.0}
-"""How much of a heading change has happened when the step is taken."""
 
 FORWARD_CAMERA: FloatArray = np.array(
     [[0.0, -1.0, 0.0, 0.0], [0.0, 0.0, -1.0, 0.0], [1.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 1.0]]
 )
 """Laser to a camera at the same place that looks forward: x right, y down, z forward."""
+
+
+def unknown_covariance(*shape: int) -> FloatArray:
+    """Covariances (*shape, 3, 3) of which nothing is known: nan, never 0, which would mean certainty."""
+    return np.full((*shape, 3, 3), np.nan)
+
+
+@dataclass(frozen=True, eq=False)
+class Step:
+    """The motion from one scan to the next.
+
+    Attributes:
+        x, y: metres ahead and to the left in the frame of the earlier scan.
+        heading: radians, counter-clockwise.
+        covariance: (3, 3) of x, y and heading in the frame of the earlier scan; nan where unknown.
+
+    >>> Step(1.0, 0.0, 0.1).array()
+    array([1. , 0. , 0.1])
+    """
+
+    x: float
+    y: float
+    heading: float
+    covariance: FloatArray = field(default_factory=unknown_covariance)
+
+    def array(self) -> FloatArray:
+        """x, y and heading, (3,)."""
+        return np.array([self.x, self.y, self.heading])
+
+
+@dataclass(frozen=True, eq=False)
+class Steps:
+    """The steps between the N consecutive scans of a drive.
+
+    Attributes:
+        values: (N-1, 3) x and y in metres and heading in radians, each in the frame of its earlier scan.
+        covariances: (N-1, 3, 3); nan where unknown.
+    """
+
+    values: FloatArray
+    covariances: FloatArray
+
+    @classmethod
+    def certain_of_nothing(cls, values: npt.ArrayLike) -> "Steps":
+        """Steps (N-1, 3) of a method that does not know how good they are."""
+        values = np.asarray(values, dtype=np.float64).reshape(-1, 3)
+        return cls(values, unknown_covariance(len(values)))
+
+    def __len__(self) -> int:
+        return len(self.values)
+
+    def poses(self) -> FloatArray:
+        """Laser poses (N, 4, 4), the first the identity."""
+        return compose(self.values)
 
 
 def wrap_angle(angle: npt.ArrayLike) -> FloatArray:
@@ -45,17 +95,37 @@ def poses_to_planar(poses: npt.ArrayLike) -> FloatArray:
     return np.stack([poses[:, 0, 3], poses[:, 1, 3], heading], axis=1)
 
 
-def relative_motions(poses: npt.ArrayLike) -> FloatArray:
-    """Motions (N-1, 2) between consecutive poses (N, 4, 4) of the laser.
-
-    Distance is the length of the step in the plane of the earlier scan, negative when the step goes
-    backwards (paper III: "travelling distance"; the sign makes reversing representable).
-    """
+def relative_steps(poses: npt.ArrayLike) -> FloatArray:
+    """Steps (N-1, 3) between consecutive poses (N, 4, 4) of the laser: x, y in metres, heading in radians."""
     poses = np.asarray(poses, dtype=np.float64)
-    steps = np.linalg.inv(poses[:-1]) @ poses[1:]
-    forward, left = steps[:, 0, 3], steps[:, 1, 3]
-    distance = np.where(forward < 0, -1.0, 1.0) * np.hypot(forward, left)
-    return np.stack([distance, np.arctan2(steps[:, 1, 0], steps[:, 0, 0])], axis=1)
+    return poses_to_planar(np.linalg.inv(poses[:-1]) @ poses[1:])
+
+
+def motions_of(steps: npt.ArrayLike) -> FloatArray:
+    """The paper's two numbers of steps (..., 3): distance in metres and heading change in radians, (..., 2).
+
+    Distance is the projection of the step on the heading in mid-turn (paper III: "travelling distance"). Its
+    sign makes reversing representable, and it is continuous for a laser that is mounted off the axis of a
+    robot that turns on the spot.
+
+    >>> motions_of([[2.0, 0.0, 0.0], [-1.0, 0.0, 0.0]])
+    array([[ 2.,  0.],
+           [-1.,  0.]])
+    """
+    x, y, heading = np.moveaxis(np.asarray(steps, dtype=np.float64), -1, 0)
+    return np.stack([x * np.cos(heading / 2) + y * np.sin(heading / 2), heading], axis=-1)
+
+
+def step_errors(steps: FloatArray, truth: FloatArray) -> FloatArray:
+    """Errors (N, 3) of steps (N, 3) in metres and radians, seen from where the true step ends.
+
+    The first is along the true heading of the later scan, the second to its left, the third the heading.
+    """
+    difference = steps - truth
+    cos, sin = np.cos(truth[:, 2]), np.sin(truth[:, 2])
+    ahead = cos * difference[:, 0] + sin * difference[:, 1]
+    left = cos * difference[:, 1] - sin * difference[:, 0]
+    return np.stack([ahead, left, wrap_angle(difference[:, 2])], axis=1)
 
 
 def motion_errors(motions: FloatArray, truth: FloatArray) -> FloatArray:
@@ -65,26 +135,29 @@ def motion_errors(motions: FloatArray, truth: FloatArray) -> FloatArray:
     return errors
 
 
-def advance(pose: FloatArray, motion: FloatArray, apply: ApplyStep = "end") -> FloatArray:
-    """The next pose, x, y and heading (3,), after one motion (2,): a step of :func:`compose`."""
+def advance(pose: FloatArray, step: FloatArray) -> FloatArray:
+    """The next pose, x, y and heading (3,), after one step (3,): a step of :func:`compose`.
+
+    >>> advance(np.array([1.0, 0.0, np.pi / 2]), np.array([2.0, 0.0, 0.0])).round(6)
+    array([1.      , 2.      , 1.570796])
+    """
     x, y, heading = pose
-    distance, turn = motion
-    direction = heading + STEP_FRACTION[apply] * turn
-    return np.array([x + distance * np.cos(direction), y + distance * np.sin(direction), heading + turn])
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([x + cos * step[0] - sin * step[1], y + sin * step[0] + cos * step[1], heading + step[2]])
 
 
-def compose(motions: npt.ArrayLike, apply: ApplyStep = "end") -> FloatArray:
-    """Poses (T+1, 4, 4), the first the identity, out of motions (T, 2): paper eq. 2.
+def compose(steps: npt.ArrayLike) -> FloatArray:
+    """Poses (T+1, 4, 4), the first the identity, out of steps (T, 3): paper eq. 2.
 
     The paper prints the heading *increment* inside the sine and cosine; the accumulated heading must
-    stand there. ``apply`` says where along the turn the step is taken.
+    stand there.
     """
-    distance, turn = np.asarray(motions, dtype=np.float64).T
+    x, y, turn = np.asarray(steps, dtype=np.float64).reshape(-1, 3).T
     heading = np.concatenate([[0.0], np.cumsum(turn)])
-    direction = heading[:-1] + STEP_FRACTION[apply] * turn
+    cos, sin = np.cos(heading[:-1]), np.sin(heading[:-1])
     planar = np.zeros((len(heading), 3))
-    planar[1:, 0] = np.cumsum(distance * np.cos(direction))
-    planar[1:, 1] = np.cumsum(distance * np.sin(direction))
+    planar[1:, 0] = np.cumsum(cos * x - sin * y)
+    planar[1:, 1] = np.cumsum(sin * x + cos * y)
     planar[:, 2] = heading
     return planar_to_poses(planar)
 

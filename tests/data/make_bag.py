@@ -35,7 +35,7 @@ def make_bag(folder: Path, kind: str, ranges: np.ndarray, topics=("/scan",), fie
 
 
 def laser_scan(store, ranges, stamp, field_of_view_deg, first, number):
-    """One message, range_max 40 m."""
+    """One message, range_max 40 m; those of odd numbers say when each beam was shot."""
     seconds = int(stamp)
     time = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=round((stamp - seconds) * 1e9))
     sequence = {"seq": number} if first else {}
@@ -45,7 +45,7 @@ def laser_scan(store, ranges, stamp, field_of_view_deg, first, number):
         angle_min=-half,
         angle_max=half,
         angle_increment=2 * half / (len(ranges) - 1),
-        time_increment=0.0,
+        time_increment=1e-4 * (number % 2),
         scan_time=0.1,
         range_min=0.1,
         range_max=40.0,

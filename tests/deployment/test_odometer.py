@@ -1,18 +1,21 @@
 """Streaming odometry: the same numbers as a whole drive at once, and what may go wrong in a stream."""
 
+import json
 import math
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from odometry import ANGLES, NAMES, build, random_scans
-from rcnn_odom.deployment.odometer import LATE_IN_A_ROW, LONGEST_HOLD, Description, Odometer
+from rcnn_odom.deployment.odometer import LATE_IN_A_ROW, LONGEST_HOLD, Odometer
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import advance, compose, poses_to_planar
+from rcnn_odom.geometry import Step, advance, compose, poses_to_planar
+from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.training.checkpoint_stepper import CheckpointStepper
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training.onnx_graph import to_onnx, write
 
 PERIOD = 0.1
@@ -21,18 +24,35 @@ PERIOD = 0.1
 class Recorder:
     """A stepper that notes what it is asked and always answers the same."""
 
-    description = Description(Sensor(1.0, 180.0, 40.0), "end", (0.6, 0.03), 0.5, PERIOD)
-    motion = np.array([0.5, 0.1])
+    description = Description(Sensor(1.0, 180.0, 40.0), (0.6, 0.05, 0.03), 0.5, PERIOD)
+    step = np.array([0.5 * np.cos(0.1), 0.5 * np.sin(0.1), 0.1])  # a turn of 0.1, then 0.5 m
+    covariance = np.diag([0.05, 0.02, 0.01]) ** 2
 
     def __init__(self):
         self.pairs, self.resets = [], 0
 
     def __call__(self, pair):
         self.pairs.append(pair)
-        return self.motion, np.array([0.05, 0.01])
+        return Step(*self.step, self.covariance)
 
     def reset(self):
         self.resets += 1
+
+
+class Remembering:
+    """A stepper whose answer depends on all pairs since its start."""
+
+    description = Description(Sensor(1.0, 180.0, 40.0), (0.6, 0.05, 0.03), 0.1, PERIOD)
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        self.state = 0.0
+
+    def __call__(self, pair):
+        self.state = 0.5 * self.state + float(np.tanh(pair[1].mean() - pair[0].mean()))
+        return Step(0.5 + 0.1 * self.state, 0.01 * self.state, 0.1 * self.state)
 
 
 @pytest.fixture
@@ -40,64 +60,61 @@ def recorder():
     return Recorder()
 
 
+def length(pose):
+    """Metres of a pose's step."""
+    return math.hypot(pose.step.x, pose.step.y)
+
+
+def assert_same(poses, expected):
+    assert [pose.as_dict() for pose in poses] == [pose.as_dict() for pose in expected]
+
+
 def drive(odometer, scans, first=0):
     return [odometer.step(scan, PERIOD * (first + number), ANGLES) for number, scan in enumerate(scans)]
 
 
-def odometers(module, folder):
-    """The module's odometers from a checkpoint and from an ONNX file."""
-    torch.save(
-        {"state_dict": module.state_dict(), "hyper_parameters": dict(module.hparams)}, folder / "best.ckpt"
-    )
-    write(to_onnx(module, "fp32"), folder / "model.onnx")
-    return Odometer.from_checkpoint(folder / "best.ckpt"), Odometer.from_onnx(folder / "model.onnx")
-
-
 @pytest.mark.parametrize(("variant", "projection"), [*((name, None) for name in NAMES), ("rcnn_reg", 8)])
 def test_steps_equal_the_offline_estimate(variant, projection, tmp_path):
-    module = build(variant, projection)
+    model = build(variant, projection)
     scans = random_scans(150)  # more than two chunks of the offline estimate
-    offline = module.estimate(torch.from_numpy(scans))
-    expected = poses_to_planar(compose(offline.motions, "middle"))
-    for odometer in odometers(module, tmp_path):
+    offline = model.estimate_scans(torch.from_numpy(scans))
+    expected = poses_to_planar(offline.poses())
+    write(to_onnx(model, "fp32"), tmp_path / "model.onnx")
+    for odometer in (Odometer(model.stepper()), Odometer.from_onnx(tmp_path / "model.onnx")):
         poses = drive(odometer, scans)
         streamed = np.array([[pose.x, pose.y, pose.heading] for pose in poses])
         np.testing.assert_allclose(streamed[:, :2], expected[:, :2], atol=1e-5)
         np.testing.assert_allclose(np.exp(1j * streamed[:, 2]), np.exp(1j * expected[:, 2]), atol=1e-5)
-        steps = np.array([[pose.distance, pose.turn] for pose in poses[1:]])
-        np.testing.assert_allclose(steps, offline.motions, atol=1e-5)
-        deviations = np.array([[pose.distance_deviation, pose.turn_deviation] for pose in poses[1:]])
-        np.testing.assert_allclose(deviations, offline.deviations, atol=1e-5)
+        steps = np.array([pose.step.array() for pose in poses[1:]])
+        np.testing.assert_allclose(steps, offline.values, atol=1e-5)
+        covariances = np.array([pose.step.covariance for pose in poses[1:]])
+        np.testing.assert_allclose(covariances, offline.covariances, atol=1e-6)
+        deviations, expected_ones = (
+            np.sqrt(np.diagonal(each, axis1=1, axis2=2)) for each in (covariances, offline.covariances)
+        )
+        np.testing.assert_allclose(deviations, expected_ones, atol=1e-5)
+        assert np.isfinite(covariances).all()
         assert not any(pose.degraded for pose in poses)
 
 
-def test_advance_is_a_step_of_compose():
-    motions = np.random.default_rng(0).normal(0, 0.5, (20, 2))
-    for apply in ("start", "middle", "end"):
-        pose, whole = np.zeros(3), poses_to_planar(compose(motions, apply))
-        for motion, expected in zip(motions, whole[1:], strict=True):
-            pose = advance(pose, motion, apply)
-            np.testing.assert_allclose(pose[:2], expected[:2], atol=1e-12)
-            assert math.remainder(pose[2] - expected[2], 2 * math.pi) == pytest.approx(0, abs=1e-12)
-
-
 def test_the_first_scan_is_the_origin_and_reset_begins_anew():
-    odometer = Odometer(CheckpointStepper(build()))
+    odometer = Odometer(Remembering())
     scans = random_scans(6)
     first = drive(odometer, scans)
     assert (first[0].x, first[0].y, first[0].heading) == (0, 0, 0)
     np.testing.assert_array_equal(first[0].matrix(), np.eye(4))
     odometer.reset()
-    assert drive(odometer, scans) == first
+    assert_same(drive(odometer, scans), first)
+    assert first[0].step.covariance.tolist() == np.zeros((3, 3)).tolist(), "the origin is known"
 
 
 def test_ranges_with_and_without_angles_and_points_are_the_same():
     scans = random_scans(5).astype(np.float64)
-    expected = drive(Odometer(CheckpointStepper(build())), scans)
-    even, points = (Odometer(CheckpointStepper(build())) for _ in range(2))
+    expected = drive(Odometer(Remembering()), scans)
+    even, points = (Odometer(Remembering()) for _ in range(2))
     for number, scan in enumerate(scans):
         stamp = PERIOD * number
-        assert even.step(scan, stamp) == expected[number]
+        assert_same([even.step(scan, stamp)], [expected[number]])
         as_points = np.column_stack([scan * np.cos(ANGLES), scan * np.sin(ANGLES), np.ones(181)])
         pose = points.step(as_points, stamp)
         assert pose.x == pytest.approx(expected[number].x, abs=1e-6)
@@ -109,12 +126,15 @@ def test_a_scan_without_returns_lets_the_last_motion_go_on(recorder):
     poses = drive(odometer, [*scans[:5], np.zeros(181), scans[5], scans[6]])
     assert len(recorder.pairs) == 4 + 1, "neither the empty scan nor the pair across it reaches the network"
     np.testing.assert_array_equal(recorder.pairs[-1], scans[5:])
-    path = poses_to_planar(compose(np.tile(Recorder.motion, (7, 1)), "end"))
+    path = poses_to_planar(compose(np.tile(Recorder.step, (7, 1))))
     np.testing.assert_allclose([[p.x, p.y, p.heading] for p in poses], path, atol=1e-12)
     assert [bool(pose.degraded) for pose in poses] == [False] * 5 + [True, True, False]
     assert "no returns" in poses[5].degraded
     assert "gap: 2 periods" in poses[6].degraded
-    assert [(pose.distance, pose.distance_deviation) for pose in poses[5:7]] == [(0.5, 0.6)] * 2
+    for pose in poses[5:7]:
+        np.testing.assert_allclose(pose.step.array(), Recorder.step)
+        np.testing.assert_allclose(pose.step.covariance, np.diag([0.6, 0.05, 0.03]) ** 2)
+    np.testing.assert_array_equal(poses[4].step.covariance, Recorder.covariance)
     assert recorder.resets == 1
 
 
@@ -145,9 +165,11 @@ def test_dropped_scans_are_bridged_and_the_state_survives(recorder):
     assert "gap: 3 periods" in after.degraded
     pose = np.array([before[-1].x, before[-1].y, before[-1].heading])
     for _ in range(3):
-        pose = advance(pose, Recorder.motion)
+        pose = advance(pose, Recorder.step)
     np.testing.assert_allclose([after.x, after.y, after.heading], pose)
-    assert (after.distance, after.distance_deviation) == pytest.approx((3 * 0.5, 3 * 0.6))
+    held = poses_to_planar(compose([Recorder.step] * 3))[-1]
+    np.testing.assert_allclose(after.step.array(), held, err_msg="as if it were three steps")
+    np.testing.assert_allclose(after.step.covariance, (3 * np.diag([0.6, 0.05, 0.03])) ** 2)
     following = odometer.step(scans[9], PERIOD * 9, ANGLES)
     assert following.degraded == ""
     np.testing.assert_array_equal(recorder.pairs[-1], scans[8:10])
@@ -159,21 +181,21 @@ def test_over_a_long_gap_the_motion_ends(recorder):
     last = drive(odometer, random_scans(6))[-1]
     pose = odometer.step(random_scans(1)[0], 3600.0, ANGLES)
     assert math.hypot(pose.x - last.x, pose.y - last.y) <= LONGEST_HOLD * 0.5
-    assert pose.distance == pytest.approx(LONGEST_HOLD * 0.5)
-    assert pose.distance_deviation > 1000
+    held = poses_to_planar(compose([Recorder.step] * LONGEST_HOLD))[-1]
+    np.testing.assert_allclose(pose.step.array(), held)
+    assert pose.step.covariance[0, 0] > 1000**2
     odometer.reset()
     drive(odometer, random_scans(6))
     empty = [odometer.step(np.zeros(181), 0.1 * n) for n in range(6, 30)]
-    steps = [pose.distance for pose in empty]
-    assert steps == [0.5] * LONGEST_HOLD + [0.0] * (24 - LONGEST_HOLD), (
-        "held for so long, then standing still"
-    )
-    assert empty[-1].distance_deviation == pytest.approx(0.6)
+    assert [length(pose) for pose in empty] == pytest.approx(
+        [0.5] * LONGEST_HOLD + [0.0] * (24 - LONGEST_HOLD)
+    ), "held for so long, then standing still"
+    assert empty[-1].step.covariance[0, 0] == pytest.approx(0.6**2)
 
 
 def test_a_late_scan_is_passed_over():
     scans = random_scans(8)
-    straight, disturbed = (Odometer(CheckpointStepper(build())) for _ in range(2))
+    straight, disturbed = (Odometer(Remembering()) for _ in range(2))
     expected = drive(straight, scans)
     drive(disturbed, scans[:5])
     for stamp in (0.4, 0.1, -5.0):
@@ -185,8 +207,9 @@ def test_a_late_scan_is_passed_over():
             expected[4].heading,
             0.4,
         )
-        assert late.distance == 0
-    assert drive(disturbed, scans[5:], first=5) == expected[5:]
+        assert not late.step.array().any()
+        assert not late.step.covariance.any()
+    assert_same(drive(disturbed, scans[5:], first=5), expected[5:])
 
 
 def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
@@ -194,7 +217,7 @@ def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
     drive(odometer, random_scans(5))
     empty = odometer.step(np.zeros(181), 0.5)
     late = odometer.step(np.full(361, 5.0), 0.45)
-    assert (late.x, late.y, late.stamp, late.distance) == (empty.x, empty.y, 0.5, 0.0)
+    assert (late.x, late.y, late.stamp, length(late)) == (empty.x, empty.y, 0.5, 0.0)
     assert "beam count" in odometer.step(np.full(361, 5.0), 0.6).degraded, "of a scan that counts"
 
 
@@ -207,7 +230,8 @@ def test_a_clock_that_is_set_costs_a_few_scans(recorder, jump):
     later = [odometer.step(scan, 2.1 + min(jump, 0) + 0.1 * n, ANGLES) for n, scan in enumerate(scans[21:])]
     kinds = [pose.degraded.split(":")[0] for pose in later]
     assert kinds == ["late scan"] * (LATE_IN_A_ROW - 1) + ["gap"] + [""] * (39 - LATE_IN_A_ROW)
-    assert later[LATE_IN_A_ROW - 1].distance in (pytest.approx(0.5 * LATE_IN_A_ROW), 0.0)
+    held = poses_to_planar(compose([Recorder.step] * LATE_IN_A_ROW))[-1]
+    assert length(later[LATE_IN_A_ROW - 1]) in (pytest.approx(math.hypot(*held[:2])), 0.0)
     assert recorder.resets == 1
 
 
@@ -218,7 +242,7 @@ def test_a_bursty_clock_is_no_gap(recorder):
     poses = [
         odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(random_scans(200), stamps, strict=True)
     ]
-    assert sum(pose.distance for pose in poses) == pytest.approx(0.5 * 199, rel=0.02)
+    assert sum(map(length, poses)) == pytest.approx(0.5 * 199, rel=0.02)
     assert sum(bool(pose.degraded) for pose in poses) <= 1
 
 
@@ -270,18 +294,18 @@ def test_one_scan_without_a_stamp_does_not_forget_the_others(recorder):
 def test_a_network_that_gives_nan_starts_anew(recorder):
     odometer, scans = Odometer(recorder), random_scans(6)
     drive(odometer, scans[:4])
-    recorder.motion = np.array([np.nan, 0.1])
+    recorder.step = np.array([np.nan, 0.0, 0.1])
     broken = odometer.step(scans[4], 0.4, ANGLES)
     assert broken.degraded == "no estimate: the last motion goes on"
-    assert (broken.distance, recorder.resets) == (0.5, 2)
-    del recorder.motion
+    assert (length(broken), recorder.resets) == (pytest.approx(0.5), 2)
+    del recorder.step
     assert odometer.step(scans[5], 0.5, ANGLES).degraded == ""
 
 
 def test_without_stamps_the_order_counts():
     scans = random_scans(5)
-    odometer = Odometer(CheckpointStepper(build()))
-    expected = drive(Odometer(CheckpointStepper(build())), scans)
+    odometer = Odometer(Remembering())
+    expected = drive(Odometer(Remembering()), scans)
     for scan, pose in zip(scans, expected, strict=True):
         got = odometer.step(scan, float("nan"), ANGLES)
         assert (got.x, got.y, got.stamp, got.degraded) == (pose.x, pose.y, None, "")
@@ -292,7 +316,7 @@ def test_another_number_of_beams_is_told_and_goes_on(recorder):
     drive(odometer, random_scans(3))
     pose = odometer.step(np.full(361, 5.0), 0.3)
     assert pose.degraded == "beam count: 361 after 181"
-    assert pose.distance == 0.5
+    assert length(pose) == pytest.approx(0.5)
     assert recorder.pairs[-1].shape == (2, 181)
     np.testing.assert_allclose(recorder.pairs[-1][1], 5.0)
     assert odometer.step(np.full(361, 5.0), 0.4).degraded == ""
@@ -338,19 +362,81 @@ def test_memory_does_not_grow(recorder):
     assert grown < 20_000, "1,800 more scans of 724 bytes each"
 
 
-def test_unfitted_deviations_are_null_in_json():
-    odometer = Odometer(CheckpointStepper(build(fitted=False)))
-    pose = drive(odometer, random_scans(2))[1]
-    assert math.isnan(pose.distance_deviation)
-    assert pose.as_dict()["distance_deviation"] is None
+def test_what_is_not_known_of_a_step_is_null_in_json(recorder):
+    recorder.covariance = np.diag([0.25, np.nan, 0.01])
+    pose = drive(Odometer(recorder), random_scans(2))[1].as_dict()
+    assert pose == json.loads(json.dumps(pose))
+    assert list(pose) == ["stamp", "x", "y", "heading", "step", "covariance", "degraded"]
+    assert pose["step"] == recorder.step.tolist()
+    assert pose["covariance"] == [[0.25, 0.0, 0.0], [0.0, None, 0.0], [0.0, 0.0, 0.01]]
+
+
+def test_a_held_step_of_unknown_size_is_known_of_nothing(recorder):
+    recorder.description = replace(Recorder.description, typical_step=(0.6, np.nan, 0.03))
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(3))
+    covariance = odometer.step(np.zeros(181), 0.3).step.covariance
+    expected = [[0.36, np.nan, 0.0], [np.nan] * 3, [0.0, np.nan, 0.0009]]
+    np.testing.assert_allclose(covariance, expected)
+
+
+def test_scans_with_bearings_of_their_own(recorder):
+    """The same beams clockwise, counter-clockwise, and beginning behind: one stream, nothing unusual."""
+    odometer, values = Odometer(recorder), random_scans(4).astype(np.float64)
+    poses = [
+        odometer.step(Scan(values[0], ANGLES, stamp=0.0)),
+        odometer.step(Scan(values[1][::-1], ANGLES[::-1], stamp=0.1)),
+        odometer.step(Scan(np.roll(values[2], 90)[1:], np.roll(ANGLES, 90)[1:], stamp=0.2)),
+        odometer.step(replace(Scan(values[3], ANGLES), has_all_beams=False)),
+    ]
+    assert [pose.degraded for pose in poses] == [""] * 4
+    assert [pose.stamp for pose in poses] == [0.0, 0.1, 0.2, None]
+    np.testing.assert_allclose(recorder.pairs[0], values[:2], rtol=1e-6)
+
+
+def test_points_say_nothing_of_the_beams(recorder):
+    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    for number in range(10):
+        bearings = np.sort(rng.uniform(-1.5, 1.5, 181 - number))
+        points = 5 * np.column_stack([np.cos(bearings), np.sin(bearings)])
+        assert "beam count" not in odometer.step(points, 0.1 * number).degraded
+
+
+def test_returns_are_those_of_the_last_scan_alone(recorder):
+    odometer = Odometer(recorder)
+    assert odometer.returns().shape == (0, 2)
+    wall = np.full(181, 5.0)
+    pose = drive(odometer, [wall, wall])[-1]
+    seen = odometer.returns()
+    np.testing.assert_allclose(np.hypot(*(seen - [pose.x, pose.y]).T), 5.0, atol=1e-5)
+    odometer.step(wall, 0.05)
+    assert odometer.returns().shape == (0, 2), "a late scan was taken elsewhere"
+    odometer.step(np.zeros(181), 0.2)
+    assert odometer.returns().shape == (0, 2), "nothing was seen from there"
+    after = odometer.step(wall, 0.3)
+    assert "gap" in after.degraded
+    np.testing.assert_allclose(np.hypot(*(odometer.returns() - [after.x, after.y]).T), 5.0, atol=1e-5)
+
+
+def test_a_checkpoint_says_that_it_is_exported_first():
+    with pytest.raises(
+        InputError, match=r"best\.ckpt: .*rcnn-odom export best\.ckpt.*load_odometer\('best\.ckpt'\)"
+    ):
+        Odometer.from_checkpoint("best.ckpt")
 
 
 @pytest.mark.parametrize(
     ("scan", "angles"),
-    [(np.zeros((2, 2, 2)), None), (np.ones(5), np.zeros(1)), (np.ones(5), np.zeros(6)), (3.0, None)],
+    [
+        (np.zeros((2, 2, 2)), None),
+        (np.zeros((2, 1)), None),
+        (np.ones(5), np.zeros(1)),
+        (np.ones(5), np.zeros(6)),
+        (3.0, None),
+    ],
 )
 def test_shapes_that_are_no_scan(recorder, scan, angles):
-    with pytest.raises(ValueError, match="a scan is ranges"):
+    with pytest.raises(ValueError, match=r"a scan is ranges|points are"):
         Odometer(recorder).step(scan, angles=angles)
 
 

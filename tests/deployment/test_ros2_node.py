@@ -11,6 +11,7 @@ from conftest import ROOT
 from odometry import build, random_scans
 from rcnn_odom.deployment.odometer import Odometer, Pose
 from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import Step
 from rcnn_odom.training.onnx_graph import to_onnx, write
 
 FILE = ROOT / "examples" / "ros2_node.py"
@@ -29,7 +30,7 @@ def scan_message(ranges, stamp):
         frame_id="laser", stamp=SimpleNamespace(sec=int(stamp), nanosec=round(stamp % 1 * 1e9))
     )
     spacing = np.deg2rad(1.0)
-    limits = {"range_min": 0.1, "range_max": 40.0}
+    limits = {"range_min": 0.1, "range_max": 40.0, "time_increment": 0.0}
     return SimpleNamespace(
         header=header, ranges=list(ranges), angle_min=-np.pi / 2, angle_increment=spacing, **limits
     )
@@ -53,15 +54,23 @@ def test_it_is_short_and_documented(example):
 
 def test_a_message_of_a_pose(example):
     message = Message()
-    example.fill(message, Pose(1.0, 2.0, -3.0, np.pi / 2, 0.5, 0.1, 0.05, 0.02), seconds=0.1)
+    covariance = np.arange(9.0).reshape(3, 3) / 100
+    example.fill(message, Pose(1.0, 2.0, -3.0, np.pi / 2, Step(0.5, 0.2, 0.1, covariance)), seconds=0.1)
     assert (message.pose.pose.position.x, message.pose.pose.position.y) == (2.0, -3.0)
     assert message.pose.pose.orientation.z == pytest.approx(np.sqrt(0.5))
-    assert (message.twist.twist.linear.x, message.twist.twist.angular.z) == pytest.approx((5.0, 1.0))
-    assert message.twist.covariance[0] == pytest.approx(0.25)
-    assert message.twist.covariance[35] == pytest.approx(0.04)
+    twist = message.twist.twist
+    assert (twist.linear.x, twist.linear.y, twist.angular.z) == pytest.approx((5.0, 2.0, 1.0))
+    got = np.reshape(message.twist.covariance, (6, 6))
+    np.testing.assert_allclose(got[np.ix_([0, 1, 5], [0, 1, 5])], 100 * covariance)
+    assert not got[2:5].any()
+    assert not got[:, 2:5].any()
     unknown = Message()
-    example.fill(unknown, Pose(distance_deviation=np.nan, turn_deviation=np.nan), seconds=0.1)
+    example.fill(unknown, Pose(step=Step(0.0, 0.0, 0.0)), seconds=0.1)
     assert unknown.twist.covariance == [0.0] * 36
+    heading_only = np.full((3, 3), np.nan)
+    heading_only[2, 2] = 0.0004
+    example.fill(unknown, Pose(step=Step(0.0, 0.0, 0.0, heading_only)), seconds=0.1)
+    assert unknown.twist.covariance == [0.0] * 35 + [pytest.approx(0.04)]
 
 
 def test_the_node_on_stand_ins(example, tmp_path, monkeypatch):
@@ -96,7 +105,7 @@ def test_the_node_on_stand_ins(example, tmp_path, monkeypatch):
     handlers[0](scan_message(scans[0], 100.2))
     expected = [odometer.step(scan, 100.0 + 0.1 * number) for number, scan in enumerate(scans)]
     got = [(m.pose.pose.position.x, m.twist.twist.linear.x) for m in published[1:4]]
-    np.testing.assert_allclose(got, [(pose.x, pose.distance / 0.1) for pose in expected[1:]], atol=1e-5)
+    np.testing.assert_allclose(got, [(pose.x, pose.step.x / 0.1) for pose in expected[1:]], atol=1e-5)
     assert (published[0].header.frame_id, published[0].child_frame_id) == ("odom", "laser")
     held = [m.twist.twist.linear.x for m in published[3:]]
     np.testing.assert_allclose(held, held[:1] * 3, rtol=1e-4, err_msg="the last speed goes on")

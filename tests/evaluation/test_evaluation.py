@@ -7,34 +7,39 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-import torch
 
+from rcnn_odom import registry
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.run_report import Estimates, report_icp, report_test
+from rcnn_odom.evaluation.metrics import Metric, all_metrics, frame_errors, planar_drift, score_metrics
+from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.evaluation.scores import (
-    camera_trajectory,
-    frame_errors,
+    coverage,
+    coverage_table,
     frame_table,
+    metrics_table,
     percent,
-    planar_drift,
     score,
     score_all,
     smooth,
     stretch_errors,
     table,
 )
-from rcnn_odom.geometry import FORWARD_CAMERA, compose, planar_to_poses
-from rcnn_odom.models.constant import ConstantMotion, held_motion, mean_motion
+from rcnn_odom.evaluation.sweep_report import load_runs
+from rcnn_odom.evaluation.sweep_report.build import make_report
+from rcnn_odom.geometry import FORWARD_CAMERA, Step, Steps, change_frame, planar_to_poses
+from rcnn_odom.models.constant import held_motion
+from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.icp import PointToLineICP, Steps
-from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.models.two_numbers import steps_of
+from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.trajectory import read_kitti, read_motions, write_motions
+from summary_runs import finish_run
 
 
 def drive(planar, name="drive", camera_from_laser=FORWARD_CAMERA):
     planar = np.asarray(planar, dtype=np.float64)
     scans, stamps = np.zeros((len(planar), 3), np.float32), np.arange(len(planar), dtype=np.float64)
-    return EncodedSequence(name, "key", scans, planar_to_poses(planar), stamps, camera_from_laser)
+    return Drive(name, "key", scans, planar_to_poses(planar), stamps, camera_from_laser)
 
 
 def straight(frames=31, name="straight"):
@@ -42,7 +47,11 @@ def straight(frames=31, name="straight"):
 
 
 def ahead(frames, distance):
-    return np.tile([distance, 0.0], (frames - 1, 1))
+    return Steps.certain_of_nothing(np.tile([distance, 0.0, 0.0], (frames - 1, 1)))
+
+
+def in_two_numbers(sequence, apply="end"):
+    return Steps.certain_of_nothing(steps_of(sequence.motions, apply))
 
 
 def test_errors_are_signed_where_they_say_so():
@@ -106,13 +115,15 @@ def test_drift_of_a_straight_drive_by_hand():
 def test_step_is_taken_where_asked_for(apply, sides):
     # Two steps with a right angle at the first frame: the truth goes left at once (turned at the start).
     sequence = drive([(0, 0, 0), (0, 2, np.pi / 2), (0, 4, np.pi / 2)])
-    off = 2 * np.abs(1j - np.exp(1j * sides * np.pi / 2))
-    report = score(sequence, sequence.motions, [3.0], apply)
+    # Of the two metres to the left, two numbers keep what is along the heading in mid-turn, 45 degrees.
+    off = np.abs(2j - np.sqrt(2) * np.exp(1j * sides * np.pi / 2))
+    report = score(sequence, in_two_numbers(sequence, apply), [3.0], apply)
     assert report["drift"]["t_err"] == report["floor"]["t_err"] == pytest.approx(off / 3, abs=1e-12)
 
 
 def test_trajectory_is_in_the_frame_of_the_camera():
-    poses = camera_trajectory(straight(3), np.array([[2.0, np.pi / 2], [1.0, 0.0]]), "start")
+    steps = Steps.certain_of_nothing(steps_of([[2.0, np.pi / 2], [1.0, 0.0]], "start"))
+    poses = change_frame(steps.poses(), FORWARD_CAMERA)
     # Ahead is z; left is -x.
     np.testing.assert_allclose(poses[:, :3, 3], [(0, 0, 0), (0, 0, 2), (-1, 0, 2)], atol=1e-12)
 
@@ -123,7 +134,7 @@ def test_camera_beside_the_laser_does_not_change_exact_motion():
     angles = np.linspace(0, 3, 61)
     planar = np.stack([10 * np.cos(angles), 10 * np.sin(angles), angles + np.pi / 2], axis=1)
     sequence = drive(planar, camera_from_laser=shifted)
-    exact = planar_drift(sequence, compose(sequence.motions, "middle"), [5.0, 10.0])
+    exact = planar_drift(sequence, in_two_numbers(sequence, "middle"), [5.0, 10.0])
     assert exact.segments > 5
     assert exact.t_err == pytest.approx(0, abs=1e-9)
 
@@ -166,15 +177,8 @@ def test_percent(ratio, text):
     assert percent(ratio) == text
 
 
-def test_baselines_repeat_one_motion():
-    scans = np.zeros((4, 3))
-    mean = ConstantMotion(np.array([1.5, -0.1])).estimate(scans)
-    np.testing.assert_allclose(mean, [[1.5, -0.1]] * 3)
-    np.testing.assert_array_equal(held_motion().estimate(scans), np.zeros((3, 2)))
-
-
 def test_odometry_that_never_moves_drifts_by_everything():
-    report = score(straight(), held_motion().estimate(np.zeros((31, 3))), [10.0])
+    report = score(straight(), held_motion().estimate(straight()), [10.0])
     assert report["drift"]["t_err"] == pytest.approx(1.1)
 
 
@@ -243,42 +247,49 @@ def test_motions_are_read_as_they_were_written(tmp_path):
     np.testing.assert_array_equal(methods["held_motion"], held)
 
 
-class StubModule(torch.nn.Linear):
-    """Looks like a trained network to whoever reports on it."""
+class Standing:
+    """A stepper that sees no motion, and counts."""
 
-    variant = "cnn_reg"
+    description = Description(Sensor(90.0, 180.0))
 
     def __init__(self):
-        super().__init__(1, 1)
+        self.pairs = []
 
-    def network(self, pairs, state):
-        return SimpleNamespace(motion=pairs[..., 0, :2]), state
+    def __call__(self, pair):
+        self.pairs.append(pair)
+        return Step(0.0, 0.0, 0.0)
 
-    network.head = SimpleNamespace(mean=torch.tensor([0.75, 0.5]))
+    def reset(self):
+        self.pairs.append(None)
 
 
 def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     sequence = drive([(0, 0, 0), (1, 0, 0), (1, 1.5, 0.25)], "05")
-    module = StubModule()
     data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
-    report_test(module, Estimates({"05": np.array([[0.875, 0.0], [1.25, -0.5]])}), [sequence], data, tmp_path)
+    steps = Steps.certain_of_nothing(steps_of([[0.875, 0.0], [1.25, -0.5]], "end"))
+    mean = np.array([0.75, 0.0, 0.0])
+    report = report_drives("cnn_reg", {"05": steps}, mean, Standing(), [sequence], data, tmp_path)
     header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
     assert header == (
         "frame,distance_m,heading_rad,true_distance_m,true_heading_rad,"
         "mean_motion_distance_m,mean_motion_heading_rad,held_motion_distance_m,held_motion_heading_rad"
     )
-    assert first == "1,0.875,0,1,0,0.75,0.5,0,0"
-    assert second == "2,1.25,-0.5,1.5,0.25,0.75,0.5,0,0"
+    assert first == "1,0.875,0,1,0,0.75,0,0,0"
+    values = [float(cell) for cell in second.split(",")]
+    # Driven at the end of the turn: projected on the heading in mid-turn, a quarter of a radian before.
+    truth = 1.5 * np.cos(np.pi / 2 - 0.125)
+    np.testing.assert_allclose(values, [2, 1.25 * np.cos(0.25), -0.5, truth, 0.25, 0.75, 0, 0, 0])
+    assert list(report) == ["test", "baselines", "latency", "versions"]
 
 
 SIDEWAYS = [(frame, 0.5 * frame, 0.1 * (frame % 2)) for frame in range(31)]
 """Half as far to the left as ahead, which a turn by half a degree cannot say."""
 
 
-def test_poses_are_scored_with_their_sideways_part():
+def test_steps_are_scored_with_their_sideways_part():
     sequence = drive(SIDEWAYS)
-    cut_to_two = score(sequence, sequence.motions, [10.0])
-    whole = score(sequence, sequence.motions, [10.0], poses=sequence.poses)
+    cut_to_two = score(sequence, in_two_numbers(sequence), [10.0])
+    whole = score(sequence, Steps.certain_of_nothing(sequence.steps), [10.0])
     assert whole["drift"]["t_err"] == pytest.approx(0, abs=1e-12)
     assert whole["drift"]["segments"] == cut_to_two["drift"]["segments"] > 0
     assert cut_to_two["drift"]["t_err"] > 0.1
@@ -286,15 +297,7 @@ def test_poses_are_scored_with_their_sideways_part():
     assert whole["distance_mae_m"] == 0
 
 
-def test_poses_by_name_stand_for_one_sequence_alone():
-    sequences = [drive(SIDEWAYS, "a"), drive(SIDEWAYS, "b")]
-    motions = {sequence.name: sequence.motions for sequence in sequences}
-    report = score_all(sequences, motions, [10.0], poses={"a": sequences[0].poses})
-    assert report["sequences"]["a"]["drift"]["t_err"] == pytest.approx(0, abs=1e-12)
-    assert report["sequences"]["b"]["drift"]["t_err"] == report["sequences"]["b"]["floor"]["t_err"]
-
-
-def test_the_report_of_scan_matching_has_whole_poses_failures_and_no_mean_motion(tmp_path, caplog):
+def test_the_report_of_whole_steps_has_a_row_of_two_numbers_and_no_mean_motion(tmp_path, caplog):
     caplog.set_level("INFO")
     sequence = drive(SIDEWAYS, "05")
     # Steps of the truth, by hand: the frame before is turned by 0.1 in every second one.
@@ -302,44 +305,167 @@ def test_the_report_of_scan_matching_has_whole_poses_failures_and_no_mean_motion
     for (x0, y0, heading0), (x1, y1, heading1) in pairwise(SIDEWAYS):
         place = complex(x1 - x0, y1 - y0) * np.exp(-1j * heading0)
         steps.append((place.real, place.imag, heading1 - heading0))
-    estimated = {"05": Steps(np.array(steps), np.arange(30) < 4)}
+    estimated = {"05": Steps.certain_of_nothing(steps)}
     data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
-    icp = PointToLineICP(Sensor(90.0, 180.0))
-    report = report_icp(icp, estimated, None, [sequence], data, tmp_path)
-    assert report["failures"] == {"05": 4}
-    assert "4 of 30 on 05" in caplog.text
+    figures = {}
+    report = report_drives(
+        "icp", estimated, None, Standing(), [sequence], data, tmp_path, figures.__setitem__
+    )
     assert report["test"]["drift"] == pytest.approx(0, abs=1e-9)
     assert list(report["baselines"]) == ["held_motion", "icp_two_numbers"]
-    assert report["latency"]["frames"] == 30
     assert {"numpy", "scipy", "numba"} <= set(report["versions"])
+    assert "coverage" not in report
+    assert table({"icp": report["test"], **report["baselines"]}) in caplog.text
+    assert metrics_table({"icp": report["test"], **report["baselines"]}) in caplog.text
     camera = read_kitti(tmp_path / "trajectories" / "05.txt")
     np.testing.assert_allclose(camera[:, [2, 0], 3] * [1, -1], np.array(SIDEWAYS)[:, :2], atol=1e-9)
     truth, methods = read_motions(tmp_path / "trajectories" / "05_motions.csv")
     np.testing.assert_allclose(methods["estimate"], truth, atol=1e-12)
     assert (tmp_path / "figures" / "05_trajectory.png").exists()
+    assert list(figures) == ["test/05_trajectory", "test/05_motion"]
+
+
+@pytest.mark.parametrize("apply", ["start", "middle", "end"])
+def test_rounding_to_single_precision_makes_no_row_of_two_numbers(tmp_path, apply):
+    sequence = drive(SIDEWAYS, "05")
+    rounded = in_two_numbers(sequence, apply).values.astype(np.float32)
+    data = {"name": "kitti", "lengths": [10.0], "apply": apply}
+    steps = {"05": Steps.certain_of_nothing(rounded)}
+    report = report_drives("rcnn_reg", steps, None, Standing(), [sequence], data, tmp_path)
+    assert list(report["baselines"]) == ["held_motion"]
 
 
 def test_wheel_odometry_is_not_cut_to_two_numbers_either(tmp_path):
     sequence = drive(SIDEWAYS, "05")
     moved = planar_to_poses([(7, 8, 1.0)]) @ sequence.poses
     sequence = replace(sequence, wheel_odometry=moved)
-    steps = {"05": Steps(np.zeros((30, 3)), np.ones(30, dtype=bool))}
     data = {"name": "carmen", "lengths": [10.0], "apply": "end"}
-    report = report_icp(PointToLineICP(Sensor(90.0, 180.0)), steps, None, [sequence], data, tmp_path)
+    steps = {"05": held_motion().estimate(sequence)}
+    report = report_drives("icp", steps, None, Standing(), [sequence], data, tmp_path)
     assert report["baselines"]["wheel_odometry"]["drift"] == pytest.approx(0, abs=1e-9)
 
 
-def test_mean_motion_is_that_of_all_training_drives(caplog):
-    drives = {"a": straight(3, "a"), "b": drive([(0, 0, 0), (4, 0, 0.3)], "b")}
+def test_the_time_of_a_frame_is_that_of_a_stream(tmp_path):
+    sequence = drive([(frame, 0, 0) for frame in range(130)], "05")
+    sequence = replace(sequence, scans=np.arange(390, dtype=np.float32).reshape(130, 3))
+    data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
+    stepper = Standing()
+    report = report_drives("x", {"05": ahead(130, 1.0)}, None, stepper, [sequence], data, tmp_path)
+    assert set(report["latency"]) == {"median_ms", "p99_ms", "frames", "threads"}
+    assert (report["latency"]["frames"], report["latency"]["threads"]) == (100, 1)
+    resets = [place for place, pair in enumerate(stepper.pairs) if pair is None]
+    begin = resets[1] + 1  # after the frames that warm up
+    measured = stepper.pairs[begin : begin + 100]
+    np.testing.assert_array_equal(measured, [sequence.scans[frame : frame + 2] for frame in range(100)])
+    assert stepper.pairs[begin + 100 :] == [None]
 
-    def read(name):
-        if name not in drives:
-            raise InputError(f"{name}: no such folder")
-        return drives[name]
 
-    found = mean_motion(read, ["a", "b"])
-    np.testing.assert_allclose(found.motion, [(1 + 1 + 4) / 3, 0.1])
-    caplog.set_level("INFO")
-    assert mean_motion(read, ["a", "c"]) is None
-    assert "mean_motion is left out" in caplog.text
-    assert "c: no such folder" in caplog.text
+def test_coverage_by_hand(tmp_path):
+    # The estimate turns by 60 degrees, so its distance goes along 30 degrees; the errors there are 0.3 and
+    # 0.1 m, and of the heading 0.02 and 0.05 radians.
+    turn, along = np.pi / 3, np.array([np.cos(np.pi / 6), np.sin(np.pi / 6)])
+    values = np.array([[*(1.0 * along), turn]] * 3)
+    truth_motions = np.array([[0.7, turn - 0.02], [0.9, turn + 0.05], [9.0, 0.0]])
+    truth = steps_of(truth_motions, "middle")
+    across = np.array([-along[1], along[0]])
+    covariances = np.full((3, 3, 3), np.nan)
+    covariances[:2] = 0.0
+    covariances[:2, :2, :2] = 0.2**2 * np.outer(along, along) + 7.0**2 * np.outer(across, across)
+    covariances[:2, 2, 2] = 0.03**2
+    steps = Steps(values, covariances)
+    report = coverage(steps, truth)
+    # Error over deviation: 1.5 and 0.5 of the distance, 0.67 and 1.67 of the heading; the last is unknown.
+    assert report["distance"] == {"1": 0.5, "2": 1.0}
+    assert report["heading"] == {"1": 0.5, "2": 1.0}
+    assert report["distance_m"] == pytest.approx(0.2)
+    assert report["heading_deg"] == pytest.approx(np.degrees(0.03))
+    assert coverage_table({"05": report}).splitlines()[-1].split() == [
+        *["05", "50.0", "100.0", "50.0", "100.0", "0.200", "1.719"]
+    ]
+    assert coverage(Steps.certain_of_nothing(values), truth) is None
+    sequence = drive([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], "05")
+    data = {"name": "kitti", "lengths": [1.0], "apply": "middle"}
+    written = report_drives("net", {"05": steps}, None, Standing(), [sequence], data, tmp_path)
+    assert written["coverage"].keys() == {"05"}
+    assert (tmp_path / "figures" / "coverage.png").exists()
+
+
+def most_ahead(drive, steps, lengths):
+    """The farthest place of an estimate, in metres; none of a drive named short."""
+    return None if drive.name == "short" else float(steps.poses()[:, 0, 3].max())
+
+
+FARTHEST = Metric("farthest_m", "farthest", "km", "higher", most_ahead, "max", 1e-3, 3)
+
+
+def add_metrics(monkeypatch, **added):
+    """Metrics as other packages add them."""
+    entries = [
+        SimpleNamespace(name=name, value="package:metric", load=lambda metric=metric: metric)
+        for name, metric in added.items()
+    ]
+    find = {"rcnn_odom.metrics": entries}.__getitem__
+    monkeypatch.setattr(registry, "entry_points", lambda group: find(group))
+
+
+def test_a_metric_of_another_package_is_everywhere(monkeypatch, tmp_path):
+    add_metrics(monkeypatch, farthest_m=FARTHEST)
+    drives = [straight(31, "05"), straight(21, "07"), straight(11, "short")]
+    steps = {one.name: ahead(len(one), 1.1) for one in drives}
+    report = score_all(drives, steps, [10.0])
+    assert report["sequences"]["05"]["farthest_m"] == pytest.approx(33)
+    assert report["sequences"]["short"]["farthest_m"] is None
+    assert report["metrics"]["farthest_m"] == pytest.approx(33)
+    assert list(report["metrics"]) == list(all_metrics())
+    lines = metrics_table({"cnn_reg": report}).splitlines()
+    assert lines[0].endswith("farthest (km)")
+    assert lines[1].endswith(" 0.033")
+    report["metrics"]["farthest_m"] = 1234.0
+    finish_run(tmp_path / "a", ["seed=0"], {"05": 0.1, "07": 0.1}, test=report)
+    finish_run(tmp_path / "b", ["seed=1"], {"05": 0.1, "07": 0.1}, {"data.test": ["05", "07"]})
+    (tmp_path / "b" / "metrics.json").unlink()
+    assert load_runs(tmp_path)["farthest_m"][0] == 1234.0
+    text = make_report(tmp_path).markdown.read_text()
+    assert "| farthest (km) |" in text
+    assert "| 1.234 |" in text
+    # A run from before the metric was added has none.
+    del report["metrics"]["farthest_m"]
+    finish_run(tmp_path / "c", ["seed=2"], {"05": 0.1, "07": 0.1}, test=report)
+    assert load_runs(tmp_path)["farthest_m"].isna().tolist() == [False, True, True]
+
+
+@pytest.mark.parametrize(
+    ("name", "metric", "said"),
+    [
+        ("best", most_ahead, "is no Metric of"),
+        ("best", FARTHEST, "is named farthest_m"),
+        ("floor", replace(FARTHEST, name="floor"), "is named floor"),
+        ("best", replace(FARTHEST, name="best", combine="median"), "combine mean, frames or max"),
+        ("best", replace(FARTHEST, name="best", compute=3), "give a function to compute it"),
+        ("drift", replace(FARTHEST, name="drift"), "two metrics are called drift"),
+    ],
+)
+def test_what_is_no_metric_is_refused_in_a_line(monkeypatch, name, metric, said):
+    add_metrics(monkeypatch, **{name: metric})
+    with pytest.raises(InputError, match=said) as refused:
+        all_metrics()
+    assert "\n" not in str(refused.value)
+
+
+def test_metrics_are_combined_as_they_say():
+    drives = [straight(31, "a"), straight(11, "b")]
+    steps = {"a": ahead(31, 1.1), "b": ahead(11, 0.8)}
+    metrics = score_all(drives, steps, [5.0])["metrics"]
+    assert metrics["distance_mae_m"] == pytest.approx((30 * 0.1 + 10 * 0.2) / 40)
+    assert metrics["distance_bias_m"] == pytest.approx((30 * 0.1 - 10 * 0.2) / 40)
+    assert metrics["distance_max_m"] == pytest.approx(0.2)
+    # Segments of 5 m end at the sixth frame, 0.1 or 0.2 m a frame off.
+    assert metrics["drift"] == pytest.approx((0.6 / 5 + 1.2 / 5) / 2)
+    assert [name for name, metric in all_metrics().items() if metric.in_training] == [
+        *["drift", "distance_mae_m", "heading_mae_deg"]
+    ]
+
+
+def test_a_metric_that_is_no_number_is_none(monkeypatch):
+    add_metrics(monkeypatch, farthest_m=replace(FARTHEST, compute=lambda *_: np.nan))
+    assert score_metrics(straight(), ahead(31, 1.0), [5.0])["farthest_m"] is None

@@ -8,13 +8,12 @@ import pytest
 import yaml
 
 from rcnn_odom.cli import main
-from rcnn_odom.evaluation.drift import drift
 from rcnn_odom.evaluation.sweep_report.build import make_report
-from rcnn_odom.evaluation.sweep_report.curves import Segments, by_speed, run_segments, trajectory
+from rcnn_odom.evaluation.sweep_report.document import code, duration, escape, markdown_table
+from rcnn_odom.evaluation.sweep_report.figures import length_curve, middle_run, trajectory
 from rcnn_odom.evaluation.sweep_report.folders import read_run
-from rcnn_odom.evaluation.sweep_report.tables import code, duration, escape, markdown_table
 from rcnn_odom.recordings.trajectory import file_name
-from summary_runs import begin_run, finish_run, write_trajectories
+from summary_runs import begin_run, finish_run, method, write_trajectories
 
 DRIFTS = {3: (0.20, 0.22, 0.18), 5: (0.10, 0.12, 0.09)}
 VALIDATION = {3: 0.15, 5: 0.16}
@@ -74,18 +73,20 @@ def test_the_tables_hold_means_and_deviations(sweep, capsys):
         "20.00 ± 2.00",
         "22.00 ± 2.00",
         "21.00 ± 2.00",
-        "0.0210 ± 0.0020",
         "4.00",
     ]
     assert row(section(text, "Drift"), "kernel_size=3") == expected
     assert row(section(text, "Drift"), "held_motion") == [
         "held_motion",
         "-",
-        *["-", "50.00", "70.00", "60.00", "0.0600", "-"],
+        *["-", "50.00", "70.00", "60.00", "-"],
     ]
     assert row(section(text, "Drift"), "floor of two-number motion")[3:6] == ["0.40"] * 3
-    frame = ["kernel_size=5", "0.2929", "-0.1464", "1.050", "0.5857", "+0.2929", "2.100"]
-    assert row(section(text, "Errors of a frame"), "kernel_size=5") == frame
+    others = section(text, "Other metrics")
+    frame = ["0.2929", "-0.1464", "1.050", "0.5857", "+0.2929", "2.100"]
+    # 0.11, 0.13, 0.10 over ten: mean 0.01133, deviations -0.0003, 0.0017, -0.0013.
+    assert row(others, "kernel_size=5") == ["kernel_size=5", "0.0113 ± 0.0015", *frame]
+    assert row(others, "held_motion")[1] == "0.0600"
     difference = row(section(text, "Differences"), "kernel_size=5")
     assert difference[1:3] == ["lower drift", "3"]
     logs = np.log([[0.11, 0.13, 0.10], [0.21, 0.23, 0.19]])
@@ -119,7 +120,7 @@ def test_the_page_needs_no_other_file(sweep):
     assert str(sweep) not in page
     assert page.count("<table>") == 5
     figures = {path.name for path in (sweep / "report_figures").iterdir()}
-    assert figures == {"drift.png", "length.png", "speed.png", "trajectories.png"}
+    assert figures == {"drift.png", "length.png", "trajectories_1.png", "trajectories_2.png"}
     for name in figures:
         assert f"(report_figures/{name})" in written.markdown.read_text()
     assert not list(sweep.rglob("*.partial"))
@@ -164,7 +165,7 @@ def test_equal_settings_show_no_difference(tmp_path):
     ]
     assert row(section(text, "Differences"), "kernel_size=5") == cells
     assert "in test drift: 0 of 1." in text
-    assert "Not drawn:" in text
+    assert "Not drawn, `5-1`: " in text
 
 
 def test_the_best_is_told_by_validation(bare):
@@ -215,7 +216,10 @@ def test_the_command_is_hydras(bare):
     make_report(bare)
     origin = section((bare / "report.md").read_text(), "Where it comes from")
     command = "python train.py -m hydra/launcher=joblib +sweeps=kernel_size 'data.val=[c[:0.5]]'"
-    assert re.findall("    (python.*)", origin) == [command]
+    assert f"The last command for this folder:\n\n    {command}\n" in origin
+    alone = "    python train.py model=cnn_cls model.kernel_size=5 seed=2"
+    assert alone in origin.split("Each run alone:\n\n")[1].splitlines()
+    assert len(re.findall("    (python.*)", origin)) == 1 + 6
 
 
 @pytest.mark.parametrize(
@@ -261,29 +265,36 @@ def test_other_versions_are_told(tmp_path):
     assert "> **Warning: the runs were made with different versions of torch.**" in text
     assert "torch 2.13.0 and 2.14" in text
     commands = "    python train.py seed=0\n    python train.py seed=1\n"
-    assert f"Put together from the options of the runs:\n\n{commands}" in text
+    assert f"Each run alone:\n\n{commands}" in text
 
 
-def test_segments_are_those_of_the_drift(finished):
-    run = read_run(finished / "kernel_size=3,seed=0", "x")
-    segments = run_segments(run, ["05"])
-    truth, estimate = trajectory(run, "05")
-    expected = drift(truth, estimate, planar=True, lengths=run.metrics.lengths)
-    assert len(segments.t_err) == expected.segments
-    assert segments.t_err.mean() == pytest.approx(expected.t_err)
-    assert segments.r_err_deg_per_m.mean() == pytest.approx(expected.r_err_deg_per_m)
-    # Ten frames a second, 0.4 to 1.4 m each.
-    assert segments.speed.min() > 4
-    assert segments.speed.max() < 14
+def test_curves_are_means_over_the_segments_of_all_sequences(tmp_path):
+    test = method({"05": 0.1, "07": 0.4})
+    few = {"segments": 2, "t_err": 0.1, "r_err_deg_per_m": 0.02}
+    test["sequences"]["05"]["drift"]["per_length"] = {"50": few | {"segments": 30}, "100": few}
+    more = {"segments": 10, "t_err": 0.4, "r_err_deg_per_m": 0.06}
+    test["sequences"]["07"]["drift"]["per_length"] = {"50": more}
+    finish_run(tmp_path / "a", ["seed=0"], {"05": 0.1, "07": 0.4}, test=test)
+    curve = length_curve(read_run(tmp_path / "a", "a"))
+    # Of 100 m there are two segments, which make no point; of 150 m none.
+    np.testing.assert_allclose(curve, [[50, (30 * 10 + 10 * 40) / 40, (30 * 0.02 + 10 * 0.06) / 40]])
 
 
-def test_speeds_have_overlapping_places_as_in_the_devkit():
-    speed = np.array([2.5, 3.0, 3.5, 9.0])
-    segments = Segments(np.full(4, 100.0), speed, np.array([0.1, 0.2, 0.3, 0.9]), np.zeros(4))
-    curve = by_speed(segments)
-    # Within 2 m/s of 2 m/s and of 4 m/s are the first three; of 10 only one, which makes no point.
-    np.testing.assert_allclose(curve.x, [2.0, 4.0])
-    np.testing.assert_allclose(curve.t_err, [0.2, 0.2])
+def test_the_run_that_is_shown_has_the_median_validation_drift(bare):
+    runs = [read_run(bare / f"kernel_size=3,seed={seed}", str(seed)) for seed in (2, 0, 1)]
+    assert middle_run(runs).name == "1"
+    assert middle_run(runs[:2]).name == "0"
+    make_report(bare)
+    text = section((bare / "report.md").read_text(), "Trajectories")
+    assert "Not drawn, `kernel_size=3,seed=1`: " in text
+
+
+def test_trajectories_start_ahead(finished):
+    truth, estimate = trajectory(read_run(finished / "kernel_size=3,seed=0", "x"), "05")
+    assert truth.shape == estimate.shape == (401, 2)
+    # 0.9 m and more ahead in the first step, a tenth more in the estimate, and nearly straight.
+    np.testing.assert_allclose(truth[1], [0.0, 0.9125], atol=0.01)
+    np.testing.assert_allclose(estimate[1], [0.0, 1.1 * 0.9125], atol=0.01)
 
 
 def test_text_of_others_stays_text():

@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.sweep_report import load_runs, runs_table
+from rcnn_odom.evaluation.sweep_report import load_runs
 from rcnn_odom.evaluation.sweep_report.runs_table import read_sweep
-from summary_runs import begin_run, finish_run, method, metrics_of, settings_of
+from summary_runs import begin_run, finish_run, method, metrics_of, older, settings_of
 
 DRIFTS = {"05": 0.2, "07": 0.1}
 
@@ -49,8 +49,9 @@ def test_one_row_a_run_with_its_scores(tmp_path):
     assert table["repeats"].isna().all()
 
 
-def test_frame_errors_are_means_over_motions_and_the_largest(tmp_path):
-    finish_run(tmp_path / "a", ["seed=0"], DRIFTS)
+@pytest.mark.parametrize("version", [dict, older])
+def test_frame_errors_are_means_over_motions_and_the_largest(tmp_path, version):
+    finish_run(tmp_path / "a", ["seed=0"], DRIFTS, test=version(method(DRIFTS)))
     row = load_runs(tmp_path).iloc[0]
     # 400 motions of 05 with 0.25 m, 300 of 07 with 0.35 m.
     mean = (400 * 0.25 + 300 * 0.35) / 700
@@ -71,7 +72,7 @@ def test_older_runs_tell_less(tmp_path):
 
 
 def test_a_drive_too_short_for_a_drift_has_none(tmp_path):
-    test = method(DRIFTS)
+    test = older(method(DRIFTS))
     nothing = {"t_err": None, "r_err_deg_per_m": None, "t_rmse": None, "segments": 0}
     test["sequences"]["07"]["drift"] = nothing
     finish_run(tmp_path / "a", ["seed=0"], DRIFTS, test=test | {"drift": 0.2})
@@ -81,7 +82,7 @@ def test_a_drive_too_short_for_a_drift_has_none(tmp_path):
     assert row["rotation_deg_per_m"] == pytest.approx(0.02)
 
 
-def test_runs_that_are_not_finished_have_a_row_with_the_reason(tmp_path, monkeypatch):
+def test_runs_that_are_not_finished_have_a_row_with_the_reason(tmp_path):
     finish_sweep(tmp_path, seeds=(0,))
     for name, seed in (("kernel_size=3,seed=1", 1), ("kernel_size=3,seed=2", 2), ("kernel_size=3,seed=3", 3)):
         begin_run(tmp_path / name, ["model=cnn_cls", "model.kernel_size=3", f"seed={seed}"])
@@ -92,8 +93,7 @@ def test_runs_that_are_not_finished_have_a_row_with_the_reason(tmp_path, monkeyp
     begin_run(tmp_path / "kernel_size=3,seed=5", ["seed=5"])
     (tmp_path / "kernel_size=3,seed=5" / "config.yaml").write_text("data: {")
     asked = [f"kernel_size=3,seed={seed}" for seed in (5, 6, 7)]
-    monkeypatch.setattr(runs_table, "expected_folders", lambda sweep: asked if sweep == tmp_path else None)
-    table = load_runs(tmp_path).set_index("run")
+    table = load_runs(tmp_path, expected=asked).set_index("run")
     assert table.loc["kernel_size=3,seed=0", "status"] == "finished"
     assert table.loc["kernel_size=3,seed=1", "status"] == "failed"
     assert table.loc["kernel_size=3,seed=1", "problem"] == "no such folder"
@@ -127,6 +127,11 @@ def test_a_spoiled_part_of_a_metrics_file_is_damage(tmp_path, key):
     assert _status_with(tmp_path, {key: spoiled}) == "damaged"
 
 
+@pytest.mark.parametrize("metrics", [["x"], {"drift": "low"}, None])
+def test_metrics_of_another_form_are_damage(tmp_path, metrics):
+    assert _status_with(tmp_path, {"test": method(DRIFTS) | {"metrics": metrics}}) == "damaged"
+
+
 @pytest.mark.parametrize("key", ["drift", "floor", "lengths", "sequences"])
 def test_a_part_that_a_score_lacks_is_damage(tmp_path, key):
     test = method(DRIFTS)
@@ -136,7 +141,7 @@ def test_a_part_that_a_score_lacks_is_damage(tmp_path, key):
 
 @pytest.mark.parametrize("key", sorted(method(DRIFTS)["sequences"]["07"]))
 def test_a_part_that_a_sequence_lacks_is_damage(tmp_path, key):
-    test = method(DRIFTS)
+    test = older(method(DRIFTS))
     del test["sequences"]["07"][key]
     assert _status_with(tmp_path, {"test": test}) == "damaged"
     assert _status_with(tmp_path, {"baselines": {"held_motion": test}}) == "damaged"
@@ -285,7 +290,8 @@ def test_no_runs_are_told(tmp_path):
 
 def test_the_fake_runs_are_like_real_ones():
     """The errors of a frame that the table takes are those that a scoring writes."""
-    from rcnn_odom.evaluation.scores import frame_errors
+    from rcnn_odom.evaluation.metrics import all_metrics, frame_errors
 
     real = frame_errors(np.ones((3, 2)), np.zeros((3, 2)))
+    assert method(DRIFTS)["metrics"].keys() == all_metrics().keys()
     assert real.keys() - method(DRIFTS)["sequences"]["05"].keys() == {"moving", "standing"}

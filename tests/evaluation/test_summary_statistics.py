@@ -45,6 +45,16 @@ def test_identical_drifts_show_no_difference():
     assert verdict(ratio, ratio.p) == "no difference shown"
 
 
+@pytest.mark.parametrize("seeds", [2, 3])
+def test_equal_ratios_cannot_be_tested(seeds):
+    """A t test of differences without any scatter would call any of them certain."""
+    second = {seed: 0.1 * (seed + 1) for seed in range(seeds)}
+    ratio = paired_ratio({seed: 0.7 * drift for seed, drift in second.items()}, second)
+    assert ratio == Ratio(seeds, pytest.approx(0.7))
+    assert holm([ratio.p, 0.03]) == [None, 0.03]
+    assert verdict(ratio, None) == "seeds do not scatter: nothing can be tested"
+
+
 def test_holm_by_hand():
     # The smallest times 4, the next times 3, then 2: 0.06 does not fall below its predecessor.
     assert holm([0.01, None, 0.04, 0.03, 0.005]) == pytest.approx([0.03, None, 0.06, 0.06, 0.02])

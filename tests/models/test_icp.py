@@ -1,15 +1,20 @@
 """Scan matching in rooms whose scans are computed exactly, and on real frames."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 from conftest import ROOT
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.scores import smooth
+from rcnn_odom.geometry import FORWARD_CAMERA
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.icp import PointToLineICP
+from rcnn_odom.models.icp import ICP, ICPOptions, PointToLineICP
+from rcnn_odom.options import check_options
 from rcnn_odom.recordings import kitti
-from rcnn_odom.recordings.cache import encode_sequences
+from rcnn_odom.recordings.cache import encode_recordings
+from rcnn_odom.recordings.recording import Drive
 
 CAR, ROBOT = Sensor(resolution_deg=0.5), Sensor(1.0, 180.0, 40.0)
 # Corners in metres; every wall is a segment from one to the next.
@@ -48,6 +53,16 @@ def match(corners, earlier, later, sensor=CAR, noise=0.0, guess=(0, 0, 0), **opt
     icp = PointToLineICP(sensor, **options)
     outlines = [icp.outline(look(corners, pose, sensor, noise, n)) for n, pose in enumerate((earlier, later))]
     return icp.match(*outlines, np.array(guess, dtype=np.float64))
+
+
+def build(sensor):
+    return ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, sensor)
+
+
+def drive_of(scans, name="a"):
+    frames = len(scans)
+    poses = np.tile(np.eye(4), (frames, 1, 1))
+    return Drive(name, "", np.asarray(scans), poses, np.arange(float(frames)), FORWARD_CAMERA)
 
 
 @pytest.mark.parametrize("sensor", [CAR, ROBOT])
@@ -130,20 +145,25 @@ def test_empty_scans_fail_and_the_last_motion_goes_on(empty):
     poses = [(0.1 * n, 0.0, 0.01 * n) for n in range(6)]
     scans = np.array([look(ROOM, pose, CAR) for pose in poses])
     scans[3] = empty(CAR.bins)
-    found = PointToLineICP(CAR).estimate(scans)
-    assert found.failed.tolist() == [False, False, True, True, False]
-    np.testing.assert_array_equal(found.steps[2], found.steps[1])
-    np.testing.assert_array_equal(found.steps[3], found.steps[1])
-    assert np.isfinite(found.poses).all()
-    np.testing.assert_allclose(found.steps[4], step_between(poses[4], poses[5]), atol=4e-3)
+    model = build(CAR)
+    stepper = model.stepper()
+    failed = [stepper.match(*pair).failed for pair in pairwise(scans)]
+    assert failed == [False, False, True, True, False]
+    found = model.estimate(drive_of(scans, "gap"))
+    assert model.failures == {"gap": 2}
+    np.testing.assert_array_equal(found.values[2], found.values[1])
+    np.testing.assert_array_equal(found.values[3], found.values[1])
+    assert np.isfinite(found.poses()).all()
+    np.testing.assert_allclose(found.values[4], step_between(poses[4], poses[5]), atol=4e-3)
 
 
 def test_a_single_point_is_too_few():
     scan = np.zeros(CAR.bins, np.float32)
     scan[100] = 5.0
-    found = PointToLineICP(CAR).estimate(np.array([scan, scan, scan]))
-    assert found.failed.all()
-    assert (found.steps == 0).all()
+    model = build(CAR)
+    found = model.estimate(drive_of([scan, scan, scan]))
+    assert model.failures == {"a": 2}
+    assert (found.values == 0).all()
 
 
 def test_along_a_bare_corridor_the_guess_stands_and_the_rest_is_measured():
@@ -155,8 +175,9 @@ def test_along_a_bare_corridor_the_guess_stands_and_the_rest_is_measured():
 
 def test_poses_put_steps_together():
     poses = [(0.0, 0.0, 0.0), (0.2, 0.1, 0.3), (0.3, 0.3, 0.5), (0.2, 0.4, 0.6)]
-    found = PointToLineICP(CAR).estimate(np.array([look(ROOM, pose, CAR) for pose in poses]))
-    for pose, (x, y, heading) in zip(found.poses, poses, strict=True):
+    found = build(CAR).estimate(drive_of([look(ROOM, pose, CAR) for pose in poses]))
+    assert np.isnan(found.covariances).all()
+    for pose, (x, y, heading) in zip(found.poses(), poses, strict=True):
         np.testing.assert_allclose(pose[:2, 3], (x, y), atol=0.01)
         assert np.arctan2(pose[1, 0], pose[0, 0]) == pytest.approx(heading, abs=0.005)
 
@@ -184,21 +205,23 @@ def test_lines_end_where_the_depth_jumps():
     ("option", "value"), [("beams", 0), ("beams", 2.5), ("max_iterations", "many"), ("max_distance", -1.0)]
 )
 def test_options_without_meaning_are_refused(option, value):
+    values = {"beams": 450, "max_iterations": 30, "max_distance": 5.0, option: value}
     with pytest.raises(InputError, match=f"model.{option}={value}: must be a"):
-        PointToLineICP(CAR, **{option: value})
+        check_options(ICPOptions, values, "model.")
 
 
 @pytest.mark.skipif(not REAL.is_dir(), reason=f"no real recordings in {REAL}")
 def test_real_frames_of_a_velodyne(tmp_path):
     drive = kitti.load("90", root=REAL)
-    sequence = encode_sequences([drive], Sensor(), tmp_path, workers=1)[0]
-    found = PointToLineICP(Sensor()).estimate(sequence.scans)
-    assert not found.failed.any()
+    encoded = encode_recordings([drive], Sensor(), tmp_path, workers=1)[0]
+    model = build(Sensor())
+    found = model.estimate(encoded)
+    assert model.failures == {"90": 0}
     # The GPS jitters by 0.05 m a frame; a published matcher errs by 4 cm and 0.007 degrees.
-    error = np.hypot(*found.steps[:, :2].T) - smooth(sequence.motions[:, 0])
+    error = np.hypot(*found.values[:, :2].T) - smooth(encoded.motions[:, 0])
     assert np.abs(error).mean() < 0.02
     assert abs(error.mean()) < 0.01
-    assert np.abs(found.steps[:, 2] - sequence.motions[:, 1]).mean() < np.deg2rad(0.02)
+    assert np.abs(found.values[:, 2] - encoded.motions[:, 1]).mean() < np.deg2rad(0.02)
 
 
 @pytest.mark.parametrize("hidden", [60, 70])
@@ -209,3 +232,28 @@ def test_other_guesses_keep_the_last_motion_along_a_corridor(hidden):
     found = icp.match(icp.outline(earlier), icp.outline(later), guess)
     assert found.failed
     np.testing.assert_allclose(found.step, guess, atol=1e-6)
+
+
+def test_a_stream_gives_the_same_steps_and_outlines_each_scan_once(monkeypatch):
+    scans = np.array([look(ROOM, (0.1 * n, 0.02 * n, 0.05 * n), CAR, 0.01, n) for n in range(6)])
+    model, outlined = build(CAR), []
+    whole, original = model.estimate(drive_of(scans)), PointToLineICP.outline
+    monkeypatch.setattr(
+        PointToLineICP, "outline", lambda icp, scan: outlined.append(1) or original(icp, scan)
+    )
+    stepper, buffer = model.stepper(), np.empty((2, CAR.bins), np.float32)
+    for _ in range(2):
+        for frame in range(5):
+            buffer[:] = scans[frame : frame + 2]  # a caller may write the next pair to the same place
+            step = stepper(buffer)
+            np.testing.assert_array_equal(step.array(), whole.values[frame])
+            assert np.isnan(step.covariance).all()
+        stepper.reset()
+    assert len(outlined) == 2 * len(scans)
+
+
+def test_a_pair_that_leaves_scans_out_is_matched_from_its_own_earlier_scan():
+    scans = [look(ROOM, (0.1 * n, 0.0, 0.0), CAR) for n in range(5)]
+    stepper = build(CAR).stepper()
+    stepper(np.array(scans[:2]))
+    np.testing.assert_allclose(stepper(np.array(scans[3:])).array(), (0.1, 0, 0), atol=4e-3)

@@ -7,6 +7,7 @@ import pytest
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.recordings.scan import Scan
 
 PAPER = Sensor()
 HALF_CIRCLE = Sensor(resolution_deg=1.0, field_of_view_deg=180.0, max_range=40.0)
@@ -161,6 +162,22 @@ def test_whole_turns_change_nothing(turns):
 def test_impossible_sensor_is_refused(options):
     with pytest.raises(InputError, match=r"data\.sensor"):
         Sensor(**options)
+
+
+def test_a_scan_is_encoded_by_its_bearings():
+    bearings, ranges = np.deg2rad([-20.0, 0.0, 35.0]), np.array([3.0, 4.0, 5.0])
+    np.testing.assert_array_equal(
+        HALF_CIRCLE.encode(Scan(ranges, bearings)), encode(bearings, ranges, HALF_CIRCLE)
+    )
+
+
+@pytest.mark.parametrize("sensor", [HALF_CIRCLE, Sensor(1.0)])
+def test_beams_without_bearings_cover_the_field_of_view_evenly(sensor):
+    # The last beam of a full circle would lie on the first.
+    beams = sensor.bins - (sensor.field_of_view_deg == 360)
+    ranges = np.arange(1.0, beams + 1) / 20
+    expected = ranges if beams == sensor.bins else np.append(ranges, ranges[0])
+    np.testing.assert_allclose(sensor.encode(Scan(ranges)), expected, rtol=1e-6)
 
 
 def test_sensor_survives_plain_numbers():

@@ -13,9 +13,10 @@ import pytest
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, planar_to_poses
-from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.recordings.cache import EncodedSequence, cache_path, encode_sequences
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.cache import cache_path, encode_recordings
+from rcnn_odom.recordings.recording import Drive, Recording
+from rcnn_odom.recordings.scan import Scan
 
 SENSOR = Sensor(1.0, 180.0, 40.0)
 FRAMES = 150
@@ -39,7 +40,8 @@ class Reader:
 
 def scan(seed, frame):
     rng = np.random.default_rng([seed, frame])
-    return rng.uniform(-np.pi, np.pi, 300), rng.uniform(0, 50, 300)
+    bearings = rng.uniform(-np.pi, np.pi, 300)
+    return Scan(rng.uniform(0, 50, 300), bearings)
 
 
 @pytest.fixture
@@ -51,7 +53,7 @@ def calls(tmp_path):
 
 def make_sequence(calls, seed=0, frames=FRAMES, **options):
     planar = np.stack([np.arange(frames) * 0.5, np.zeros(frames), np.zeros(frames)], axis=1)
-    return Sequence(
+    return Recording(
         name=f"drive{seed}",
         poses=planar_to_poses(planar),
         stamps=np.arange(frames, dtype=np.float64),
@@ -62,7 +64,7 @@ def make_sequence(calls, seed=0, frames=FRAMES, **options):
 
 
 def direct(seed, frames=FRAMES, sensor=SENSOR):
-    return np.stack([encode(*scan(seed, frame), sensor) for frame in range(frames)])
+    return np.stack([sensor.encode(scan(seed, frame)) for frame in range(frames)])
 
 
 def files(folder):
@@ -72,7 +74,7 @@ def files(folder):
 
 def test_two_workers_give_what_direct_encoding_gives(tmp_path, calls):
     sequences = [make_sequence(calls, 0), make_sequence(calls, 1, frames=3)]
-    first, second = encode_sequences(sequences, SENSOR, tmp_path / "deep" / "cache", workers=2)
+    first, second = encode_recordings(sequences, SENSOR, tmp_path / "deep" / "cache", workers=2)
     np.testing.assert_array_equal(first.scans, direct(0))
     np.testing.assert_array_equal(second.scans, direct(1, 3))
     assert (first.name, second.name) == ("drive0", "drive1")
@@ -85,10 +87,10 @@ def test_two_workers_give_what_direct_encoding_gives(tmp_path, calls):
 
 def test_second_call_reads_the_file_and_no_scan(tmp_path, calls):
     cache = tmp_path / "cache"
-    [before] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [before] = encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     for path in calls.iterdir():
         path.unlink()
-    [after] = encode_sequences([make_sequence(calls, broken=5)], SENSOR, cache, workers=1)
+    [after] = encode_recordings([make_sequence(calls, broken=5)], SENSOR, cache, workers=1)
     assert files(calls) == []
     assert after.key == before.key
     np.testing.assert_array_equal(after.scans, direct(0))
@@ -100,12 +102,12 @@ def test_second_call_reads_the_file_and_no_scan(tmp_path, calls):
 @pytest.mark.parametrize("place", [0, 9, 200, -40, -1])
 def test_damaged_file_is_noticed_and_encoded_again(tmp_path, calls, caplog, place):
     cache = tmp_path / "cache"
-    encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     [path] = cache.glob("*.npy")
     content = bytearray(path.read_bytes())
     content[place] ^= 1
     path.write_bytes(content)
-    [again] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [again] = encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(again.scans, direct(0))
     assert f"{path}: damaged" in caplog.text
     content[place] ^= 1
@@ -115,19 +117,19 @@ def test_damaged_file_is_noticed_and_encoded_again(tmp_path, calls, caplog, plac
 @pytest.mark.parametrize("bytes_left", [0, 10, 500, -1])
 def test_cut_off_file_is_noticed_and_encoded_again(tmp_path, calls, caplog, bytes_left):
     cache = tmp_path / "cache"
-    encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     [path] = cache.glob("*.npy")
     path.write_bytes(path.read_bytes()[:bytes_left])
-    [again] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [again] = encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(again.scans, direct(0))
     assert f"{path}: damaged" in caplog.text
 
 
 def test_only_what_is_missing_is_encoded(tmp_path, calls):
     cache = tmp_path / "cache"
-    encode_sequences([make_sequence(calls, 0, frames=4)], SENSOR, cache, workers=1)
+    encode_recordings([make_sequence(calls, 0, frames=4)], SENSOR, cache, workers=1)
     sequences = [make_sequence(calls, 1, frames=3), make_sequence(calls, 0, frames=4, broken=2)]
-    first, second = encode_sequences(sequences, SENSOR, cache, workers=1)
+    first, second = encode_recordings(sequences, SENSOR, cache, workers=1)
     np.testing.assert_array_equal(first.scans, direct(1, 3))
     np.testing.assert_array_equal(second.scans, direct(0, 4))
 
@@ -156,10 +158,10 @@ def test_key_does_not_change_with_the_truth(tmp_path, calls):
 def test_stopped_encoding_leaves_nothing(tmp_path, calls):
     cache = tmp_path / "cache"
     with pytest.raises(InputError, match="frame 140: damaged"):
-        encode_sequences([make_sequence(calls, broken=140)], SENSOR, cache, workers=2)
+        encode_recordings([make_sequence(calls, broken=140)], SENSOR, cache, workers=2)
     assert files(calls)
     assert files(cache) == []
-    [encoded] = encode_sequences([make_sequence(calls)], SENSOR, cache, workers=1)
+    [encoded] = encode_recordings([make_sequence(calls)], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(encoded.scans, direct(0))
 
 
@@ -170,7 +172,7 @@ def test_partial_file_of_a_killed_process_is_not_believed(tmp_path, calls):
     path = cache_path(sequence, SENSOR, cache)
     left = cache / f".{path.stem}.{os.getpid() + 1}.partial"
     left.write_bytes(b"\x93NUMPY truncated")
-    [encoded] = encode_sequences([sequence], SENSOR, cache, workers=1)
+    [encoded] = encode_recordings([sequence], SENSOR, cache, workers=1)
     np.testing.assert_array_equal(encoded.scans, direct(0, 5))
     assert path.name in files(cache)
 
@@ -184,18 +186,18 @@ def test_full_disk_is_told_in_a_line_and_leaves_nothing_of_what_did_not_fit(tmp_
         with pytest.raises(
             InputError, match=r"0 MB of encoded scans cannot be written \(.+\); make room"
         ) as e:
-            encode_sequences(sequences, SENSOR, cache, workers=2)
+            encode_recordings(sequences, SENSOR, cache, workers=2)
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, (soft, hard))
     assert "\n" not in str(e.value)
     assert set(files(cache)) <= {cache_path(sequences[0], SENSOR, cache).name}
-    for seed, encoded in enumerate(encode_sequences(sequences, SENSOR, cache, workers=2)):
+    for seed, encoded in enumerate(encode_recordings(sequences, SENSOR, cache, workers=2)):
         np.testing.assert_array_equal(encoded.scans, direct(seed, len(encoded)))
 
 
 def test_result_does_not_depend_on_the_number_of_workers(tmp_path, calls):
     sequences = [make_sequence(calls, seed, frames=30 + 50 * seed) for seed in range(4)]
-    one, three = (encode_sequences(sequences, SENSOR, tmp_path / str(n), workers=n) for n in (1, 3))
+    one, three = (encode_recordings(sequences, SENSOR, tmp_path / str(n), workers=n) for n in (1, 3))
     assert [drive.key for drive in one] == [drive.key for drive in three]
     for name in files(tmp_path / "1"):
         assert (tmp_path / "1" / name).read_bytes() == (tmp_path / "3" / name).read_bytes()
@@ -205,7 +207,7 @@ def test_part_is_a_view_of_the_same_frames():
     frames = 10
     planar = np.stack([np.arange(frames) ** 2 / 10, np.zeros(frames), np.zeros(frames)], axis=1)
     scans = np.arange(frames * 3, dtype=np.float32).reshape(frames, 3)
-    whole = EncodedSequence(
+    whole = Drive(
         "drive",
         "key",
         scans,
@@ -231,11 +233,11 @@ def test_workers_end_when_their_parent_is_killed(tmp_path):
     script.write_text(f"""
 from functools import partial
 from pathlib import Path
-from rcnn_odom.recordings.cache import encode_sequences
+from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.models.encoding import Sensor
-from stub_drives import read
+from stub_drives import load
 if __name__ == "__main__":
-    encode_sequences([read("00", seconds=0.01, frames=20_000)], Sensor(), Path({str(folder)!r}), 2)
+    encode_recordings([load("00", seconds=0.01, frames=20_000)], Sensor(), Path({str(folder)!r}), 2)
 """)
     environment = {"PYTHONPATH": ":".join(sys.path)}
     parent = subprocess.Popen([sys.executable, str(script)], start_new_session=True, env=environment)

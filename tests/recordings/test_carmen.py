@@ -13,7 +13,8 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import planar_to_poses, poses_to_planar
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import carmen
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from scans import beams
 
 DATA = SHARED / "data"
 
@@ -38,12 +39,12 @@ def flaser(
     return f"FLASER {len(readings.split())} {readings} {pose} {odom} {time}"
 
 
-def load_lines(root: Path, *lines: str, **options: float) -> Sequence:
+def load_lines(root: Path, *lines: str, **options: float) -> Recording:
     write_log(root / "log.log", list(lines))
     return carmen.load("log", root=root, **options)
 
 
-def notes_of(sequence: Sequence) -> str:
+def notes_of(sequence: Recording) -> str:
     return "; ".join(sequence.notes)
 
 
@@ -60,7 +61,9 @@ def test_made_log(tmp_path: Path, fmt: str, compress: str | None) -> None:
     np.testing.assert_allclose(sequence.stamps, 1000 + 0.2 * np.arange(20), atol=1e-5)
     assert sequence.wheel_odometry is not None
     np.testing.assert_allclose(sequence.wheel_odometry, planar_to_poses(wheel_odometry(planar)), atol=1e-7)
-    angles, _ = sequence.read_scan(0)
+    scan = sequence.read_scan(19)
+    assert (scan.stamp, scan.has_all_beams) == (sequence.stamps[19], True)
+    angles, _ = beams(sequence.read_scan(0))
     np.testing.assert_allclose(np.rad2deg(angles), np.arange(-90, 90), atol=1e-4)
     assert f"20 scans of 180 beams ({fmt})" in sequence.notes
 
@@ -70,7 +73,7 @@ def test_scans_agree_with_the_truth(tmp_path: Path) -> None:
     sequence = carmen.load("robot", root=tmp_path)
     clouds = []
     for frame in (0, 5):
-        angles, ranges = sequence.read_scan(frame)
+        angles, ranges = beams(sequence.read_scan(frame))
         points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), 0 * angles, 1 + 0 * angles])
         clouds.append((sequence.poses[frame] @ points[:, ranges < 80])[:2].T)
     nearest = np.linalg.norm(clouds[1][:, None] - clouds[0][None], axis=2).min(axis=1)
@@ -78,7 +81,7 @@ def test_scans_agree_with_the_truth(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    ("beams", "degrees"),
+    ("count", "degrees"),
     [
         (180, np.arange(-90, 90)),
         (181, np.arange(-90, 91)),
@@ -86,17 +89,17 @@ def test_scans_agree_with_the_truth(tmp_path: Path) -> None:
         (361, np.arange(-90, 90.5, 0.5)),
     ],
 )
-def test_beam_spacing(tmp_path: Path, beams: int, degrees: np.ndarray) -> None:
-    sequence = load_lines(tmp_path, flaser(" ".join(["1.5"] * beams)))
-    angles, ranges = sequence.read_scan(0)
+def test_beam_spacing(tmp_path: Path, count: int, degrees: np.ndarray) -> None:
+    sequence = load_lines(tmp_path, flaser(" ".join(["1.5"] * count)))
+    angles, ranges = beams(sequence.read_scan(0))
     np.testing.assert_allclose(np.rad2deg(angles), degrees, atol=1e-9)
     assert (ranges == 1.5).all()
-    assert encode(angles, ranges, Sensor(1.0, 180.0, 40.0)).shape == (181,)
+    assert Sensor(1.0, 180.0, 40.0).encode(sequence.read_scan(0)).shape == (181,)
 
 
 def test_field_of_view_is_an_option(tmp_path: Path) -> None:
     sequence = load_lines(tmp_path, flaser("1 2 3"), field_of_view_deg=240.0)
-    np.testing.assert_allclose(np.rad2deg(sequence.read_scan(0)[0]), [-120, 0, 120])
+    np.testing.assert_allclose(np.rad2deg(sequence.read_scan(0).bearings), [-120, 0, 120])
     with pytest.raises(InputError, match="field_of_view_deg"):
         load_lines(tmp_path, flaser("1 2 3"), field_of_view_deg=400.0)
 
@@ -104,7 +107,7 @@ def test_field_of_view_is_an_option(tmp_path: Path) -> None:
 def test_robotlaser_says_its_angles_and_maximum_itself(tmp_path: Path) -> None:
     line = "ROBOTLASER1 0 -1.0 2.0 0.5 30.0 0.01 0 4 1 29.9 30 31 2 7 7 3 4 0 2.8 4 0 0 0 0 0 0 9.5 host 0"
     sequence = load_lines(tmp_path, line)
-    angles, ranges = sequence.read_scan(0)
+    angles, ranges = beams(sequence.read_scan(0))
     np.testing.assert_allclose(angles, [-1.0, -0.5, 0.0, 0.5])
     np.testing.assert_array_equal(ranges, [1, 29.9, np.inf, np.inf])
     assert sequence.stamps.tolist() == [9.5]
@@ -132,7 +135,7 @@ def test_order_of_the_file_and_beam_counts(tmp_path: Path) -> None:
         "",
         flaser("7 8 9 10", time="8 host 0"),
     )
-    assert [sequence.read_scan(frame)[1].tolist() for frame in range(3)] == [
+    assert [sequence.read_scan(frame).ranges.tolist() for frame in range(3)] == [
         [1, 2, 3, 4],
         [5, 6],
         [7, 8, 9, 10],
@@ -159,7 +162,7 @@ def test_notes_on_timestamps_and_truth(tmp_path: Path) -> None:
 def test_no_returns_are_counted_and_left_to_encode(tmp_path: Path) -> None:
     sequence = load_lines(tmp_path, flaser("1 -1 0 nan inf 39.9 40 81.9"), max_range=40.0)
     assert "6 readings are no returns (not positive, or 40 m and more), 75.0% of all" in sequence.notes
-    angles, ranges = sequence.read_scan(0)
+    angles, ranges = beams(sequence.read_scan(0))
     assert len(ranges) == 8
     assert np.count_nonzero(encode(angles, ranges, Sensor(1.0, 180.0, 40.0))) == 2
     assert (
@@ -170,14 +173,14 @@ def test_no_returns_are_counted_and_left_to_encode(tmp_path: Path) -> None:
 
 def test_made_log_has_no_returns(tmp_path: Path) -> None:
     make_carmen(tmp_path, "robot", frames=20)
-    ranges = np.concatenate([carmen.load("robot", root=tmp_path).read_scan(i)[1] for i in range(20)])
+    ranges = np.concatenate([carmen.load("robot", root=tmp_path).read_scan(i).ranges for i in range(20)])
     assert 0.002 < np.mean(ranges == MAX_READING) < 0.03
 
 
 def test_read_scan_can_be_pickled(tmp_path: Path) -> None:
     make_carmen(tmp_path, "robot", frames=3)
     read_scan = carmen.load("robot", root=tmp_path).read_scan
-    for one, two in zip(read_scan(2), pickle.loads(pickle.dumps(read_scan))(2), strict=True):
+    for one, two in zip(beams(read_scan(2)), beams(pickle.loads(pickle.dumps(read_scan))(2)), strict=True):
         np.testing.assert_array_equal(one, two)
 
 
@@ -285,7 +288,7 @@ def test_broken_packing(tmp_path: Path, compress: str, harm: str) -> None:
 HEADER = "# raw_scan_index(in x),ipc_time,ref_x,ref_y,ref_theta,odom_x"
 
 
-def load_with_reference(root: Path, *rows: str) -> Sequence:
+def load_with_reference(root: Path, *rows: str) -> Recording:
     make_carmen(root, "robot", frames=3)
     (root / "robot_dense_ref.csv").write_text("\n".join(rows) + "\n")
     return carmen.load("robot.log", root=root, reference=root)
@@ -339,7 +342,7 @@ def test_real_intel(real: Path) -> None:
     notes = notes_of(sequence)
     assert "631 timestamps go backwards" in notes
     assert "just the wheel odometry" in notes
-    assert encode(*sequence.read_scan(0), Sensor(1.0, 180.0, 40.0)).shape == (181,)
+    assert Sensor(1.0, 180.0, 40.0).encode(sequence.read_scan(0)).shape == (181,)
 
 
 @pytest.mark.parametrize(
@@ -356,7 +359,7 @@ def test_real_logs_with_reference(real: Path, name: str, scans: int, beams: int)
     if name == "aces":
         known = np.flatnonzero(~unknown)
         assert (known[0], scans - 1 - known[-1], len(known)) == (136, 188, scans - 136 - 188)
-    vector = encode(*sequence.read_scan(200), Sensor(1.0, 180.0, 40.0))
+    vector = Sensor(1.0, 180.0, 40.0).encode(sequence.read_scan(200))
     assert vector.shape == (181,)
     assert np.count_nonzero(vector) > 100
 

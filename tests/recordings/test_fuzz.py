@@ -20,6 +20,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import carmen, json_lines, kitti
 from rcnn_odom.recordings.trajectory import read_kitti
+from scans import beams
 
 pytestmark = pytest.mark.filterwarnings("error::RuntimeWarning")
 
@@ -51,7 +52,7 @@ def check_sequence(sequence):
     assert np.isfinite(sequence.stamps).all()
     for frame in range(len(sequence)):
         try:
-            angles, ranges = sequence.read_scan(frame)
+            angles, ranges = beams(sequence.read_scan(frame))
         except InputError as error:
             check_error(error)
         else:
@@ -144,7 +145,7 @@ def test_carmen_logs(log, data, kind):
     if sequence is not None:
         check_sequence(sequence)
     for scan in try_all("CARMEN logs streamed", lambda: list(carmen.stream(path).scans)) or []:
-        check_scan(scan.angles, scan.ranges)
+        check_scan(scan.bearings, scan.ranges)
 
 
 @given(data=st.data(), pack=st.sampled_from([(gzip.compress, "gz"), (bz2.compress, "bz2")]))
@@ -185,7 +186,7 @@ def test_kitti_recordings(recording, data):
             check_sequence(sequence)
         stream = try_all("KITTI streams", lambda: kitti.stream(root / "sequences" / "00"))
         for scan in (try_all("KITTI streams", lambda: list(stream.scans)) or []) if stream else []:
-            assert scan.ranges.ndim == 2
+            check_scan(*beams(scan))
             assert np.isfinite(scan.ranges).all()
     finally:
         (root / name).write_bytes(original)
@@ -229,13 +230,8 @@ def test_json_lines(line):
     scans = list(stream.scans)
     assert len(scans) + stream.skipped.total() == sum(bool(part.strip()) for part in line.split("\n"))
     for scan in scans:
-        if scan.ranges.ndim == 2:
-            x, y = scan.ranges.T
-            check_scan(np.arctan2(y, x), np.hypot(x, y))
-        elif scan.angles is not None:
-            check_scan(scan.angles, scan.ranges)
-        else:
-            check_scan(np.zeros(len(scan.ranges)), scan.ranges)
+        bearings = np.zeros(len(scan.ranges)) if scan.bearings is None else scan.bearings
+        check_scan(bearings, scan.ranges)
 
 
 def test_an_undamaged_log_and_recording_are_read(log, recording, tmp_path):
@@ -247,4 +243,4 @@ def test_an_undamaged_log_and_recording_are_read(log, recording, tmp_path):
     shutil.copytree(root, tmp_path / "copy")
     check_sequence(kitti.load("00", root=tmp_path / "copy"))
     [scan] = json_lines.stream([GOOD_LINE]).scans
-    check_scan(scan.angles, scan.ranges)
+    check_scan(*beams(scan))

@@ -9,9 +9,10 @@ import pytest
 from conftest import SHARED
 from data.make_kitti import LEVEL_RING, TR, make_kitti
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import poses_to_planar, relative_motions
+from rcnn_odom.geometry import motions_of, poses_to_planar, relative_steps
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import kitti
+from scans import beams
 
 DATA = SHARED / "data"
 
@@ -52,17 +53,19 @@ def test_truth_is_that_of_the_laser(tmp_path: Path) -> None:
 
 def test_scan_shows_the_level_ring_of_the_made_world(root: Path) -> None:
     sequence = kitti.load("00", root=root)
-    angles, ranges = sequence.read_scan(1)
+    angles, ranges = beams(sequence.read_scan(1))
     assert angles.shape == ranges.shape
+    assert sequence.read_scan(1).stamp == sequence.stamps[1]
+    assert not sequence.read_scan(1).has_all_beams
     assert f"ring {LEVEL_RING} " in sequence.notes[1]
     assert 650 < len(angles) <= 720
-    other, _ = kitti.load("00", root=root, ring=0).read_scan(1)
+    other, _ = beams(kitti.load("00", root=root, ring=0).read_scan(1))
     assert len(other) != len(angles) or not np.array_equal(other, angles)
 
 
 def test_range_is_horizontal(root: Path) -> None:
     points = np.fromfile(scan_file(root, 0), "<f4").reshape(-1, 4).astype(float)
-    _, ranges = kitti.load("00", root=root, ring=0).read_scan(0)
+    _, ranges = beams(kitti.load("00", root=root, ring=0).read_scan(0))
     np.testing.assert_allclose(ranges, np.sqrt(points[: len(ranges), 0] ** 2 + points[: len(ranges), 1] ** 2))
 
 
@@ -71,7 +74,7 @@ def test_scans_agree_with_the_truth(root: Path) -> None:
     sequence = kitti.load("00", root=root)
     clouds = []
     for frame in (0, 3):
-        angles, ranges = sequence.read_scan(frame)
+        angles, ranges = beams(sequence.read_scan(frame))
         points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles), 0 * angles, 1 + 0 * angles])
         clouds.append((sequence.poses[frame] @ points)[:2].T)
     nearest = np.linalg.norm(clouds[1][:, None] - clouds[0][None], axis=2).min(axis=1)
@@ -80,7 +83,7 @@ def test_scans_agree_with_the_truth(root: Path) -> None:
 
 def test_read_scan_can_be_pickled(root: Path) -> None:
     read_scan = kitti.load("00", root=root).read_scan
-    for one, two in zip(read_scan(2), pickle.loads(pickle.dumps(read_scan))(2), strict=True):
+    for one, two in zip(beams(read_scan(2)), beams(pickle.loads(pickle.dumps(read_scan))(2)), strict=True):
         np.testing.assert_array_equal(one, two)
 
 
@@ -233,22 +236,22 @@ def test_frame_without_the_ring(root: Path) -> None:
 
 def test_points_that_are_not_finite_are_missing_returns(root: Path) -> None:
     sequence = kitti.load("00", root=root)
-    angles, _ = sequence.read_scan(1)
+    angles, _ = beams(sequence.read_scan(1))
     points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
     points[kitti.ring_starts(points)[LEVEL_RING] + 5] = np.nan
     points.tofile(scan_file(root, 1))
     again = kitti.load("00", root=root)
     assert again.notes == sequence.notes
-    np.testing.assert_array_equal(again.read_scan(1)[0], np.delete(angles, 5))
+    np.testing.assert_array_equal(again.read_scan(1).bearings, np.delete(angles, 5))
 
 
 def test_frame_with_a_ring_too_many_gives_the_same_laser(root: Path) -> None:
     sequence = kitti.load("00", root=root)
-    expected = sequence.read_scan(1)
+    expected = beams(sequence.read_scan(1))
     points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
     first_ring = points[: kitti.ring_starts(points)[1]]
     np.concatenate([first_ring, points]).tofile(scan_file(root, 1))
-    for found, wanted in zip(sequence.read_scan(1), expected, strict=True):
+    for found, wanted in zip(beams(sequence.read_scan(1)), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)
 
 
@@ -285,7 +288,7 @@ def test_real_ring(real: Path, name: str, scans: int) -> None:
         ring = points[wraps[6] : wraps[7]]
         elevation = np.rad2deg(np.arctan2(ring[:, 2], np.hypot(ring[:, 0], ring[:, 1])))
         assert abs(np.median(elevation)) < 0.3
-        angles, ranges = sequence.read_scan(frame)
+        angles, ranges = beams(sequence.read_scan(frame))
         np.testing.assert_allclose(angles % (2 * np.pi), azimuth[wraps[6] : wraps[7]], atol=1e-5)
         assert 1700 <= np.count_nonzero(encode(angles, ranges, Sensor())) <= 2000
 
@@ -298,9 +301,11 @@ def test_real_motion_is_that_of_the_laser(real: Path) -> None:
     tr = np.vstack([np.array(text.split(), dtype=float).reshape(3, 4), last_row[0]])
     laser = np.array([np.linalg.inv(tr) @ pose @ tr for pose in camera])
     steps = np.array([np.linalg.solve(one, two) for one, two in pairwise(laser)])
-    motions = relative_motions(kitti.load("90", root=real).poses)
-    np.testing.assert_allclose(motions[:, 0], np.hypot(steps[:, 0, 3], steps[:, 1, 3]), atol=1e-9)
-    np.testing.assert_allclose(motions[:, 1], np.arctan2(steps[:, 1, 0], steps[:, 0, 0]), atol=1e-9)
+    motions = motions_of(relative_steps(kitti.load("90", root=real).poses))
+    turn = np.arctan2(steps[:, 1, 0], steps[:, 0, 0])
+    in_mid_turn = np.cos(turn / 2) * steps[:, 0, 3] + np.sin(turn / 2) * steps[:, 1, 3]
+    np.testing.assert_allclose(motions[:, 0], in_mid_turn, atol=1e-9)
+    np.testing.assert_allclose(motions[:, 1], turn, atol=1e-9)
     assert motions[0, 0] == pytest.approx(1.44, abs=0.005)
     assert motions[-1, 0] == pytest.approx(1.12, abs=0.005)
     assert motions[:, 0].sum() == pytest.approx(48.1, abs=0.1)

@@ -14,11 +14,12 @@ from scipy.spatial import cKDTree
 from scipy.spatial.transform import Rotation
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, relative_motions
+from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, motions_of, relative_steps
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import kitti
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.simulated import FRAMES, load
+from scans import beams
 
 WORLDS = ["street", "indoor"]
 NAMES = [f"{number:02d}" for number in range(11)]
@@ -32,16 +33,16 @@ def streets() -> list[list[FloatArray]]:
     return [[drive.read_scan.points(frame) for frame in (0, 15, 29)] for drive in drives]
 
 
-def digest(sequence: Sequence, frame: int) -> str:
+def digest(sequence: Recording, frame: int) -> str:
     return hashlib.sha256(sequence.read_scan.points(frame).tobytes()).hexdigest()
 
 
-def in_world(sequence: Sequence, frame: int, pose: FloatArray | None = None) -> FloatArray:
+def in_world(sequence: Recording, frame: int, pose: FloatArray | None = None) -> FloatArray:
     pose = sequence.poses[frame] if pose is None else pose
     return sequence.read_scan.points(frame)[:, :3].astype(np.float64) @ pose[:3, :3].T + pose[:3, 3]
 
 
-def tilt_deg(sequence: Sequence) -> FloatArray:
+def tilt_deg(sequence: Recording) -> FloatArray:
     """Pitch and roll (N, 2) by SciPy."""
     return Rotation.from_matrix(sequence.poses[:, :3, :3]).as_euler("ZYX", degrees=True)[:, 1:]
 
@@ -132,7 +133,7 @@ def test_sensor_is_given_whole_or_in_part_or_not_at_all() -> None:
     ):
         assert load("05", frames=9, sensor=one).fingerprint == load("05", frames=9).fingerprint
     assert np.hypot(*load("05", frames=9, sensor={"max_range": 20.0}).read_scan.points(3)[:, :2].T).max() < 20
-    angles, _ = load("05", frames=9, world="indoor", sensor={"field_of_view_deg": 90.0}).read_scan(3)
+    angles, _ = beams(load("05", frames=9, world="indoor", sensor={"field_of_view_deg": 90.0}).read_scan(3))
     assert np.abs(np.rad2deg(angles)).max() < 45.1
 
 
@@ -150,7 +151,8 @@ def test_small_drives_are_a_tenth_and_those_that_score_are_long_enough() -> None
     for name in NAMES:
         if name in ("05", "07", "10"):
             for seed in range(5):
-                assert relative_motions(load(name, seed=seed).poses)[:, 0].sum() >= 400, (name, seed)
+                steps = relative_steps(load(name, seed=seed).poses)
+                assert motions_of(steps)[:, 0].sum() >= 400, (name, seed)
         else:
             assert len(load(name)) == FRAMES["small"][name]
             assert abs(FRAMES["small"][name] / FRAMES["full"][name] - 0.1) < 0.01
@@ -210,14 +212,28 @@ def test_frames_outside_the_drive_are_refused() -> None:
 
 
 @pytest.mark.parametrize("world", WORLDS)
-def test_poses_are_rigid_and_stamps_even(world: str) -> None:
+def test_poses_are_rigid_and_stamps_grow(world: str) -> None:
     sequence = load("05", frames=200, world=world)
     turns = sequence.poses[:, :3, :3]
     np.testing.assert_allclose(turns @ turns.transpose(0, 2, 1), np.tile(np.eye(3), (200, 1, 1)), atol=1e-12)
     np.testing.assert_allclose(np.linalg.det(turns), 1)
     np.testing.assert_array_equal(sequence.poses[:, 3], np.tile([0, 0, 0, 1], (200, 1)))
-    np.testing.assert_allclose(sequence.stamps, 0.1 * np.arange(200), atol=1e-12)
+    if world == "street":
+        np.testing.assert_allclose(sequence.stamps, 0.1 * np.arange(200), atol=1e-12)
+    assert np.diff(sequence.stamps).min() > 0
+    assert [sequence.read_scan(frame).stamp for frame in (0, 150)] == sequence.stamps[[0, 150]].tolist()
     np.testing.assert_array_equal(sequence.camera_from_laser, FORWARD_CAMERA)
+
+
+def test_robots_have_the_stamps_of_their_own_lasers() -> None:
+    """A car's laser turns 10 times a second, each robot's scans 2 to 12 times."""
+    drives = [load("05", frames=200, world="indoor", seed=seed) for seed in range(8)]
+    periods = [np.median(np.diff(drive.stamps)) for drive in drives]
+    assert len({round(period, 3) for period in periods}) == len(drives)
+    assert all(1 / 12.5 < period < 1 / 1.8 for period in periods)
+    for drive, period in zip(drives, periods, strict=True):
+        distance = np.abs(motions_of(relative_steps(drive.poses))[:, 0])
+        assert 0.35 < np.percentile(distance, 90) / period < 0.75, "half a metre a second, and drifting"
 
 
 def test_cars_tilt_and_climb_unless_told_not_to() -> None:
@@ -250,7 +266,8 @@ def test_a_braking_car_nods() -> None:
     slopes = []
     for seed in range(20):
         sequence, level = load("00", frames=454, seed=seed), load("00", frames=454, seed=seed, tilt=False)
-        speed = np.gradient(np.concatenate([[0], np.cumsum(relative_motions(level.poses)[:, 0])]), 0.1)
+        distance = motions_of(relative_steps(level.poses))[:, 0]
+        speed = np.gradient(np.concatenate([[0], np.cumsum(distance)]), 0.1)
         braking = -np.gradient(np.convolve(speed, np.ones(9) / 9, "same"), 0.1)[10:-10]
         z = sequence.poses[:, 2, 3]
         climb = np.gradient(z, 0.1)[10:-10] / np.maximum(speed[10:-10], 1)
@@ -280,7 +297,7 @@ def test_scan_is_that_of_its_points(world: str) -> None:
         assert points.dtype == np.float32
         assert points.shape[1] == 4
         assert points.flags.c_contiguous
-        angles, ranges = sequence.read_scan(frame)
+        angles, ranges = beams(sequence.read_scan(frame))
         assert angles.dtype == ranges.dtype == np.float64
         x, y = points[:, 0].astype(np.float64), points[:, 1].astype(np.float64)
         np.testing.assert_array_equal(angles, np.arctan2(y, x))
@@ -331,7 +348,7 @@ def test_rooms_are_seen_by_nearly_every_beam() -> None:
     for seed in range(4):
         sequence = load("00", frames=20, world="indoor", seed=seed)
         for frame in (0, 19):
-            angles, ranges = sequence.read_scan(frame)
+            angles, ranges = beams(sequence.read_scan(frame))
             assert 140 < len(angles) <= 181
             assert np.abs(angles).max() <= np.pi / 2 + 1e-6
             assert ((ranges > 0.1) & (ranges < 40)).all()
@@ -343,7 +360,7 @@ def test_without_movers_what_differs_is_little() -> None:
     for seed in range(3):
         moving, still = (load("00", frames=10, seed=seed, movers=m, missing=False) for m in (True, False))
         np.testing.assert_array_equal(moving.poses, still.poses)
-        one, other = (encode(*sequence.read_scan(4), Sensor()) for sequence in (moving, still))
+        one, other = (Sensor().encode(sequence.read_scan(4)) for sequence in (moving, still))
         both = (one > 0) & (other > 0)
         same.append(np.mean(np.abs(one - other)[both] < 0.3))
     assert min(same) > 0.8

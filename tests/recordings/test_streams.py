@@ -15,16 +15,19 @@ from data.make_bag import FORMATS, START, make_bag
 from data.make_carmen import make_carmen
 from data.make_kitti import LEVEL_RING, make_kitti
 from rcnn_odom.errors import InputError
-from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings import carmen, json_lines, kitti
-from rcnn_odom.recordings.formats import Scan, ScanStream, need_fitting_scan, open_stream
+from rcnn_odom.recordings.formats import need_fitting_scan, open_stream
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
+from scans import beams
 
 RANGES = np.random.default_rng(0).uniform(1, 39, (12, 181))
 REAL = SHARED / "data"
 
 
 def read(path, **options):
-    stream = open_stream(path, **options)
+    stream = open_stream(path, options)
     return stream, list(stream.scans)
 
 
@@ -37,9 +40,10 @@ def test_a_kitti_folder_needs_no_poses(tmp_path):
     np.testing.assert_array_equal(stream.camera_from_laser, sequence.camera_from_laser)
     for frame, scan in enumerate(scans):
         assert scan.stamp == sequence.stamps[frame]
-        angles, ranges = sequence.read_scan(frame)
-        np.testing.assert_array_equal(np.hypot(*scan.ranges.T), ranges)
-        np.testing.assert_array_equal(np.arctan2(scan.ranges[:, 1], scan.ranges[:, 0]), angles)
+        angles, ranges = beams(sequence.read_scan(frame))
+        np.testing.assert_array_equal(scan.ranges, ranges)
+        np.testing.assert_array_equal(scan.bearings, angles)
+        assert not scan.has_all_beams
     assert f"ring {LEVEL_RING}" in stream.notes[1]
     _, others = read(tmp_path / "sequences" / "05", ring=0)
     assert not np.array_equal(others[0].ranges, scans[0].ranges)
@@ -61,8 +65,8 @@ def test_a_carmen_log_gives_the_scans_of_its_sequence(tmp_path, fmt, compress):
     stream, scans = read(next(tmp_path.glob("robot*")))
     assert (len(scans), stream.has_clock, stream.total) == (10, False, None)
     for frame, scan in enumerate(scans):
-        angles, ranges = sequence.read_scan(frame)
-        np.testing.assert_array_equal(scan.angles, angles)
+        angles, ranges = beams(sequence.read_scan(frame))
+        np.testing.assert_array_equal(scan.bearings, angles)
         np.testing.assert_array_equal(scan.ranges, ranges)
         assert scan.stamp == sequence.stamps[frame]
 
@@ -115,9 +119,12 @@ def test_a_bag_gives_its_scans(tmp_path, kind):
     assert (len(scans), stream.total, stream.has_clock) == (12, 12, True)
     np.testing.assert_allclose([scan.stamp for scan in scans], START + 0.1 * np.arange(12), atol=1e-6)
     np.testing.assert_array_equal(scans[3].ranges[:5], 0)
-    np.testing.assert_allclose(np.rad2deg(scans[0].angles), np.arange(-90, 91), atol=1e-4)
+    assert scans[2].times is None, "a time increment of 0 says nothing"
+    np.testing.assert_allclose(scans[3].times, 1e-4 * np.arange(181), rtol=1e-6)
+    assert {scan.frame_id for scan in scans} == {"laser"}
+    np.testing.assert_allclose(np.rad2deg(scans[0].bearings), np.arange(-90, 91), atol=1e-4)
     sensor = Sensor(1.0, 180.0, 40.0)
-    np.testing.assert_allclose(encode(scans[1].angles, scans[1].ranges, sensor), RANGES[1], rtol=1e-6)
+    np.testing.assert_allclose(sensor.encode(scans[1]), RANGES[1], rtol=1e-6)
     assert not stream.skipped
 
 
@@ -134,7 +141,7 @@ def test_which_topic_of_a_bag(tmp_path, kind):
     with pytest.raises(InputError, match="several LaserScan topics; choose one with --topic: /back, /front"):
         open_stream(several)
     with pytest.raises(InputError, match="no LaserScan topic /side; choose one with --topic: /back, /front"):
-        open_stream(several, topic="/side")
+        open_stream(several, {"topic": "/side", "ring": None})
     assert len(read(several, topic="/back")[1]) == 12
     (tmp_path / "none").mkdir()
     with pytest.raises(
@@ -174,9 +181,11 @@ def test_json_lines():
     ]
     scans = list(json_lines.stream(lines).scans)
     np.testing.assert_array_equal(scans[0].ranges, [1, np.nan, 3])
-    assert (scans[0].stamp, scans[0].angles, scans[1].stamp) == (1.5, None, None)
-    np.testing.assert_array_equal(scans[1].angles, [-0.5, -0.25])
-    np.testing.assert_array_equal(scans[2].ranges, [[1, 2], [3, 4]])
+    assert (scans[0].stamp, scans[0].bearings, scans[1].stamp) == (1.5, None, None)
+    np.testing.assert_array_equal(scans[1].bearings, [-0.5, -0.25])
+    np.testing.assert_allclose(scans[2].ranges, np.sqrt([5, 25]))
+    np.testing.assert_allclose(np.tan(scans[2].bearings), [2, 4 / 3])
+    assert [scan.has_all_beams for scan in scans] == [True, True, False]
 
 
 @pytest.mark.parametrize(
@@ -216,20 +225,20 @@ def stream_of(**options):
 
 
 def test_another_laser_than_the_models_is_refused(tmp_path):
-    sick = Scan(np.ones(181), np.deg2rad(np.arange(-90.0, 91.0)), None)
+    sick = Scan(np.ones(181), np.deg2rad(np.arange(-90.0, 91.0)))
     fits, other = Sensor(1.0, 180.0, 40.0), Sensor()
     need_fitting_scan(stream_of(), sick, fits)
-    need_fitting_scan(stream_of(), Scan(np.ones(180), None, None), fits)
-    half_degrees = Scan(np.ones(361), np.deg2rad(np.arange(-90.0, 90.5, 0.5)), None)
+    need_fitting_scan(stream_of(), Scan(np.ones(180)), fits)
+    half_degrees = Scan(np.ones(361), np.deg2rad(np.arange(-90.0, 90.5, 0.5)))
     need_fitting_scan(stream_of(), half_degrees, fits)
     with pytest.raises(InputError, match="a laser of 181 degrees, a beam every 1, but the model is for 360"):
         need_fitting_scan(stream_of(), sick, other)
-    sparse = Scan(np.ones(720), np.deg2rad(0.5 * np.arange(720)), None)
-    for scan in (sparse, Scan(np.ones(720), None, None), Scan(np.ones(1), np.zeros(1), None)):
+    sparse = Scan(np.ones(720), np.deg2rad(0.5 * np.arange(720)))
+    for scan in (sparse, Scan(np.ones(720)), Scan(np.ones(1), np.zeros(1))):
         with pytest.raises(InputError, match="but the model is for 360"):
             need_fitting_scan(stream_of(), scan, other)
     with pytest.raises(InputError, match="but the model is for 180"):
-        need_fitting_scan(stream_of(), Scan(np.ones(181), np.full(181, np.nan), None), fits)
+        need_fitting_scan(stream_of(), Scan(np.ones(181), np.full(181, np.nan)), fits)
     make_kitti(tmp_path, ["05"], frames=2)
     velodyne, scans = read(tmp_path / "sequences" / "05")
     need_fitting_scan(velodyne, scans[0], other)
@@ -237,9 +246,8 @@ def test_another_laser_than_the_models_is_refused(tmp_path):
         InputError, match=r"a laser of 360 degrees, a beam every 0\.18, but the model is for 180"
     ):
         need_fitting_scan(velodyne, scans[0], fits)
-    need_fitting_scan(
-        stream_of(), Scan(np.ones((5, 2)), None, None), fits
-    )  # points do not say what beams there are
+    points = Scan.from_points(np.ones((5, 2)))  # which do not say what beams there are
+    need_fitting_scan(stream_of(), points, fits)
 
 
 @pytest.mark.parametrize("name", ["aces", "intel", "mit-csail", "mit-killian"])
@@ -253,6 +261,6 @@ def test_real_logs_give_the_scans_of_their_sequence(name):
     for frame, scan in enumerate(stream.scans):
         count += 1
         if frame % 500 == 0:
-            np.testing.assert_array_equal(scan.ranges, sequence.read_scan(frame)[1])
+            np.testing.assert_array_equal(scan.ranges, sequence.read_scan(frame).ranges)
     assert count == len(sequence)
     assert not stream.skipped

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.cache import Encoding
 from rcnn_odom.recordings.workers import CHUNK, ONE_THREAD, Workers, share
-from stub_drives import FRAMES, read
+from stub_drives import FRAMES, load
 
 SENSOR = Sensor(1.0, 180.0, 40.0)
 KITTI = [4541, 4661, 801, 271, 1101, 4071, 1591, 1201, 2761, 1101, 1101]
@@ -50,13 +50,13 @@ def encoded(workers):
 
 @pytest.mark.parametrize("count", [1, 3])
 def test_workers_give_what_direct_encoding_gives_as_often_as_asked(count):
-    with Workers(count, Encoding(read, SENSOR)) as workers:
+    with Workers(count, Encoding(load, SENSOR)) as workers:
         for _ in range(2):
             scans, poses = encoded(workers)
             for name, its_scans, its_poses in zip(NAMES, scans, poses, strict=True):
-                direct = [encode(*read(name).read_scan(frame), SENSOR) for frame in range(FRAMES[name])]
+                direct = [SENSOR.encode(load(name).read_scan(frame)) for frame in range(FRAMES[name])]
                 np.testing.assert_array_equal(its_scans, direct)
-                np.testing.assert_array_equal(its_poses, read(name).poses)
+                np.testing.assert_array_equal(its_poses, load(name).poses)
 
 
 def test_workers_have_one_thread_each_and_no_ear_for_ctrl_c():
@@ -90,7 +90,7 @@ def tell_environment(name, start, stop):
 
 
 def test_failure_of_a_reader_ends_the_workers_and_keeps_its_message():
-    workers = Workers(2, Encoding(partial(read, broken="02"), SENSOR))
+    workers = Workers(2, Encoding(partial(load, broken="02"), SENSOR))
     with pytest.raises(InputError) as failure:
         encoded(workers)
     assert str(failure.value) == "02: frame 20 is damaged; copy it again"
@@ -100,7 +100,7 @@ def test_failure_of_a_reader_ends_the_workers_and_keeps_its_message():
 
 @pytest.mark.parametrize("pieces_before", [0, 1])
 def test_killed_worker_is_told_of(pieces_before):
-    with Workers(2, Encoding(partial(read, seconds=0.01), SENSOR)) as workers:
+    with Workers(2, Encoding(partial(load, seconds=0.01), SENSOR)) as workers:
         pieces = workers.run(NAMES, LENGTHS)
         for _ in range(pieces_before):
             next(pieces)

@@ -4,10 +4,10 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from compare_simulation import motion_figures, real_motion, simulated_motion, table
 from scipy.spatial import cKDTree
 
 from conftest import SHARED
-from rcnn_odom.comparison.motion import real_recordings, simulated_recordings, statistics, table
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.street.city import KERB, Plan, Warp, random_plan, random_warp
 from rcnn_odom.simulation.street.drive import PACE, Drive, at_other_paces, random_drive
@@ -146,7 +146,7 @@ TOLERANCES = {
 def test_motion_is_like_that_of_real_drives() -> None:
     if not REAL.is_dir():
         pytest.skip("../shared/data/kitti_gt_poses is not here: no real drives to compare with")
-    real, simulated = statistics([*real_recordings(REAL).values()]), statistics(simulated_recordings(5))
+    real, simulated = motion_figures([*real_motion(REAL).values()]), motion_figures(simulated_motion(5))
     for name, factor in TOLERANCES.items():
         ratio = simulated[name] / real[name]
         assert 1 / factor < ratio < factor, f"{name}: {simulated[name]:.3f}, really {real[name]:.3f}"
@@ -154,7 +154,7 @@ def test_motion_is_like_that_of_real_drives() -> None:
 
 def test_table_has_a_row_for_every_figure() -> None:
     figures = {"one": 1.0, "other": float("nan"), "large": 1234.5}
-    assert table({"a": figures, "b": figures}).splitlines() == [
+    assert table({"a": figures, "b": figures}, digits=2).splitlines() == [
         "|  | a | b |",
         "| --- | ---: | ---: |",
         "| one | 1.00 | 1.00 |",

@@ -4,10 +4,10 @@ import numpy as np
 import pytest
 
 from conftest import SHARED
-from rcnn_odom.geometry import planar_to_poses, relative_motions
+from rcnn_odom.geometry import motions_of, planar_to_poses, relative_steps
 from rcnn_odom.simulation.indoor.building import plan_building
 from rcnn_odom.simulation.indoor.people import populate
-from rcnn_odom.simulation.indoor.robot import random_walk
+from rcnn_odom.simulation.indoor.robot import random_robot, random_walk
 from rcnn_odom.simulation.scene import NO_WALLS
 
 CARMEN = SHARED / "data" / "carmen"
@@ -18,7 +18,7 @@ SEEDS = range(100)
 def world(seed, frames=FRAMES, people=True):
     rng = np.random.default_rng(seed)
     building = plan_building(rng)
-    planar = random_walk(building, frames, rng)
+    planar, _ = random_walk(building, frames, rng)
     return planar, populate(building, planar, rng, people)
 
 
@@ -123,11 +123,32 @@ def test_robots_drive_as_real_ones_do(worlds):
     for name in ("mit-killian", "intel", "mit-csail"):
         table = np.genfromtxt(CARMEN / "reference" / f"{name}_dense_ref.csv", delimiter=",", names=True)
         planar = np.stack([table["ref_x"], table["ref_y"], table["ref_theta"]], axis=1)
-        motions = relative_motions(planar_to_poses(planar))
+        motions = motions_of(relative_steps(planar_to_poses(planar)))
         real.append(motion_statistics(motions[~np.isnan(motions).any(axis=1)]))
     generated = motion_statistics(
-        np.concatenate([relative_motions(planar_to_poses(planar)) for planar, _ in worlds])
+        np.concatenate([motions_of(relative_steps(planar_to_poses(planar))) for planar, _ in worlds])
     )
     for what, value in generated.items():
         figures = [statistics[what] for statistics in real]
         assert 0.75 * min(figures) <= value <= 1.25 * max(figures), (what, value, figures)
+
+
+def test_stamps_are_those_of_the_robots_laser():
+    """Twice to 12 times a second: as far apart as half a metre a second says, with lost scans between."""
+    periods = []
+    for seed in range(20):
+        building, robot = (
+            plan_building(np.random.default_rng(seed)),
+            random_robot(np.random.default_rng(seed)),
+        )
+        planar, stamps = random_walk(building, FRAMES, np.random.default_rng(seed))  # draws the robot first
+        interval = np.diff(stamps)
+        assert (stamps.shape, stamps[0]) == ((FRAMES,), 0)
+        assert interval.min() > 0
+        assert np.median(interval) == pytest.approx(robot.step / 0.5, rel=0.05)
+        speed = np.hypot(*np.diff(planar[:, :2], axis=0).T) / interval
+        assert np.percentile(speed, 95) < 0.9
+        assert 1 < interval.max() / np.median(interval) < 3.2
+        periods.append(np.median(interval))
+    assert 1 / 12.5 < min(periods) < 1 / 6
+    assert 1 / 4 < max(periods) < 1 / 1.8

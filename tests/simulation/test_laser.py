@@ -9,13 +9,13 @@ from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings.kitti import ring_starts
 from rcnn_odom.simulation.laser import hdl64_ring, scanner
 from rcnn_odom.simulation.scene import NO_WALLS, Material, Scene, Walls
-from rcnn_odom.simulation.street.terrain import Ground, flat_ground, stand
+from rcnn_odom.simulation.terrain import Ground, flat_ground, stand
 
 REAL = SHARED / "data" / "kitti" / "sequences"
 RING_HEIGHT, RING_DROP = 0.206, np.tan(np.deg2rad(0.452))
 """Ring 7 of KITTI's HDL-64: metres above the laser's origin, and metres down for each metre of range."""
 
-HDL, SICK = hdl64_ring(80.0), scanner(Sensor(1.0, 180.0, 40.0))
+HDL, SICK = hdl64_ring(80.0), scanner(1.0, 180.0, 40.0)
 NOWHERE = np.zeros(2, dtype=np.int64)
 
 
@@ -180,7 +180,7 @@ def test_uphill_begins_ahead() -> None:
 
 def test_robots_laser_has_one_beam_for_every_bin() -> None:
     for sensor in (Sensor(1.0, 180.0, 40.0), Sensor(0.5, 90.0, 30.0), Sensor(1.0, 360.0, 40.0)):
-        points = look(scanner(sensor), room(20.0))
+        points = look(scanner(**sensor.as_dict()), room(20.0))
         assert not points[:, 2].any()
         x, y = points[:, :2].T.astype(np.float64)
         assert np.count_nonzero(encode(np.arctan2(y, x), np.hypot(x, y), sensor)) == sensor.bins

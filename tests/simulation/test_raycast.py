@@ -8,7 +8,7 @@ from scipy.spatial.transform import Rotation
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.raycast import HIT_GROUND, NO_WALL, cast
 from rcnn_odom.simulation.scene import Walls
-from rcnn_odom.simulation.street.terrain import Ground, random_ground
+from rcnn_odom.simulation.terrain import Ground, random_ground
 
 MAX_RANGE = 80.0
 

@@ -11,7 +11,7 @@ from rcnn_odom.simulation.scene import NO_WALLS, Scene, Walls, join
 from rcnn_odom.simulation.street.city import LANE_OFFSET, Plan, Warp, random_plan, random_warp
 from rcnn_odom.simulation.street.drive import Drive, random_drive
 from rcnn_odom.simulation.street.street import LINED_WITH, SIGHT, Side, build_streets, car_outline, car_size
-from rcnn_odom.simulation.street.terrain import Ground, flat_ground, random_ground
+from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground
 
 SEEDS = range(20)
 CLEAR = 1.2

@@ -6,7 +6,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.simulation.street.terrain import HILLINESS_DEG, Ground, flat_ground, random_ground, stand
+from rcnn_odom.simulation.terrain import HILLINESS_DEG, Ground, flat_ground, random_ground, stand
 
 CORNER = np.array([-100.0, -100.0])
 LEVEL = np.zeros((1, 2))

@@ -11,8 +11,8 @@ from rcnn_odom.simulation.scene import NO_WALLS, Scene
 from rcnn_odom.simulation.street.city import LANE_OFFSET, Plan, Warp, random_plan, random_warp
 from rcnn_odom.simulation.street.drive import Drive, random_drive
 from rcnn_odom.simulation.street.speed import FRAME_TIME
-from rcnn_odom.simulation.street.terrain import Ground, random_ground
 from rcnn_odom.simulation.street.traffic import CAR_SPEED, WALKER_SPEED, build_traffic
+from rcnn_odom.simulation.terrain import Ground, random_ground
 
 FRAMES = 100
 SEEDS = range(12)

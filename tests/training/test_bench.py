@@ -2,13 +2,15 @@
 
 import os
 from pathlib import Path
+from tempfile import TemporaryDirectory
 
 import numpy as np
 import pytest
 import torch
 
-from rcnn_odom.models.networks import RCNN
-from rcnn_odom.training import bench
+from rcnn_odom.models.rcnn import RCNNRegression
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.training import bench, bench_train
 from rcnn_odom.training.bench import Way
 
 
@@ -23,7 +25,6 @@ def test_all_ways_are_measured_and_compared(monkeypatch, capsys):
     printed = capsys.readouterr().out
     for row in (
         "eager nn.LSTM",
-        "checkpoint",
         "onnx fp32",
         "onnx int8",
         "rcnn_small",
@@ -35,29 +36,29 @@ def test_all_ways_are_measured_and_compared(monkeypatch, capsys):
 
 def test_ratios_are_those_of_the_medians():
     times = {"read fp32 weights": 9.0, "read int8 weights": 2.0, "convolutions": 1.0, "eager nn.LSTM": 150.0}
-    times |= {"checkpoint": 12.0, "onnx fp32": 13.0, "onnx int8": 4.5, "rcnn_small": 0.9}
+    times |= {"onnx fp32": 13.0, "onnx int8": 4.5, "rcnn_small": 0.9}
     times |= {"around the network": 0.1, "icp": 4.5}
     ways = {name: Way(lambda frame: None, times=[value, value, 50.0]) for name, value in times.items()}
     rows = {
         line[:25].strip(): line[25:].split()[0]
-        for line in bench.report(ways, bench.build("rcnn_reg")).splitlines()
+        for line in bench.report(ways, bench.build(RCNNRegression)).splitlines()
         if "=" in line
     }
     assert float(rows["eager / onnx int8"]) == pytest.approx(33.3)
     assert float(rows["onnx int8 / its floor"]) == 1.5
-    assert float(rows["checkpoint / fp32 floor"]) == 1.2
     assert float(rows["onnx fp32 / fp32 floor"]) == 1.3
 
 
 def test_the_eager_network_is_the_same_network():
-    """What is slower computes the same: with its weights copied, ``nn.LSTM`` gives the module's motions."""
-    module = bench.build("rcnn_reg", hidden=16)
-    assert isinstance(module.network, RCNN)
+    """What is slower computes the same: with its weights copied, ``nn.LSTM`` gives the same motions."""
+    network = bench.build(RCNNRegression, hidden=16)
     depths = np.random.default_rng(0).uniform(0, 70, (6, 3601)).astype(np.float32)
-    step = bench.eager(module.network, depths)
+    step = bench.eager(network, depths)
     with torch.inference_mode():
         got = [step(frame).motion.flatten().numpy() for frame in range(1, 6)]
-    np.testing.assert_allclose(got, module.estimate(torch.from_numpy(depths)).motions, atol=1e-5)
+        pairs = torch.from_numpy(np.stack([depths[:-1], depths[1:]], axis=1))[None]
+        expected, _ = network.motions(pairs)
+    np.testing.assert_allclose(got, expected.motion[0].numpy(), atol=1e-5)
 
 
 def test_the_floor_reads_memory_that_is_there(monkeypatch):
@@ -69,13 +70,33 @@ def test_the_floor_reads_memory_that_is_there(monkeypatch):
     def resident():
         return int(statm.read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
 
-    module = bench.build("rcnn_reg", hidden=512)
-    scans = [(np.linspace(-3, 3, 1800), np.full(1800, 5.0))] * 2
-    ways = bench.build_ways(module, scans)
+    network = bench.build(RCNNRegression, hidden=512)
+    scans = [Scan(np.full(1800, 5.0), np.linspace(-3, 3, 1800))] * 2
+    ways = bench.build_ways(network, scans)
     for way in ways.values():
         way.step(1)
     before = resident()
     floor = ways.pop("read fp32 weights")
-    weights = sum(parameter.nbytes for parameter in module.network.lstm.parameters())
+    weights = sum(parameter.nbytes for parameter in network.lstm.parameters())
     del floor, way
     assert before - resident() > 0.9 * weights
+
+
+def test_training_is_compared_with_a_plain_loop(monkeypatch):
+    for name, value in {"SECONDS": 0.0, "WARM_UP": 1, "FRAMES": 30, "EPOCH": 600}.items():
+        monkeypatch.setattr(bench_train, name, value)
+    with TemporaryDirectory() as outputs:
+        for model in bench_train.CASES.values():
+            settings = bench_train.settings_of(model, "32-true", outputs)
+            settings["data"]["sensor"]["resolution_deg"] = 1.0
+            settings["model"]["batch_size"] = 2
+            if "hidden_size" in settings["model"]:
+                settings["model"]["hidden_size"] = 16
+            assert bench_train.plain_loop(settings) > 0
+            assert bench_train.ours(settings) > 0
+
+
+def test_the_table_compares_medians_with_the_plain_loop():
+    paces = {"CNN": {"plain loop, fp32": [90.0, 100.0, 500.0], "ours, fp32": [250.0, 240.0, 260.0]}}
+    rows = [line.split() for line in bench_train.report(paces).splitlines()[1:]]
+    assert [row[-2:] for row in rows] == [["100", "1.00"], ["250", "2.50"]]

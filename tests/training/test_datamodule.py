@@ -1,24 +1,17 @@
-"""Windows, their sampler, the parts of recordings, and augmentation against a simulated room."""
-
-from itertools import pairwise
+"""Windows, their sampler, the parts of recordings, and augmentation against a room that is drawn exactly."""
 
 import numpy as np
 import pytest
 import torch
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FORWARD_CAMERA, planar_to_poses
+from rcnn_odom.geometry import FORWARD_CAMERA, advance, planar_to_poses
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.recordings.cache import EncodedSequence
-from rcnn_odom.recordings.recording import Sequence
-from rcnn_odom.training.datamodule import (
-    OdometryDataModule,
-    Windows,
-    WindowSampler,
-    cut,
-    parse_part,
-    turn_scan,
-)
+from rcnn_odom.recordings.parts import cut, parse_part
+from rcnn_odom.recordings.recording import Drive, Recording
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.training.datamodule import OdometryDataModule
+from rcnn_odom.training.windows import Windows, WindowSampler, turn_scan
 
 torch.set_num_threads(1)
 FULL, HALF = Sensor(1.0, 360.0, 40.0), Sensor(1.0, 180.0, 40.0)
@@ -47,7 +40,7 @@ def random_planar(frames, seed=0):
 def encoded(planar, name="room", sensor=FULL, scans=None):
     scans = np.stack([look(pose, sensor) for pose in planar]) if scans is None else scans
     stamps = np.arange(len(planar), dtype=np.float64)
-    return EncodedSequence(name, f"key-{name}", scans, planar_to_poses(planar), stamps, FORWARD_CAMERA)
+    return Drive(name, f"key-{name}", scans, planar_to_poses(planar), stamps, FORWARD_CAMERA)
 
 
 def numbered(frames, first=0, name="numbered"):
@@ -66,34 +59,29 @@ def wrap(angle):
     return np.angle(np.exp(1j * np.asarray(angle)))
 
 
-def second_pose(planar, motion):
-    """Where the second scan was taken, from the first pose, the true place and the label's turn."""
-    return [planar[1][0], planar[1][1], planar[0][2] + motion[1]]
-
-
 # --- windows -------------------------------------------------------------------------------------
 
 
-def test_window_holds_consecutive_pairs_and_their_motions():
-    sequences = [numbered(6), numbered(5, first=100)]
-    windows = Windows(sequences, FULL, length=3)
+def test_window_holds_consecutive_pairs_and_their_steps():
+    drives = [numbered(6), numbered(5, first=100)]
+    windows = Windows(drives, FULL, length=3)
     batch = windows.__getitems__([(2, 0, False), (6, 0, False), (7, 0, False)])
     assert batch["pairs"].shape == (3, 3, 2, 361)
-    assert batch["motions"].shape == (3, 3, 2)
-    assert batch["pairs"].dtype == batch["motions"].dtype == torch.float32
+    assert batch["steps"].shape == (3, 3, 3)
+    assert batch["pairs"].dtype == batch["steps"].dtype == torch.float32
     first_frames = [[2, 3, 4], [100, 101, 102], [101, 102, 103]]
     assert batch["pairs"][:, :, 0, 0].tolist() == first_frames
     assert batch["pairs"][:, :, 1, 0].tolist() == [[n + 1 for n in row] for row in first_frames]
-    np.testing.assert_allclose(batch["motions"][..., 0], first_frames)
-    np.testing.assert_allclose(batch["motions"][..., 1], 0, atol=1e-7)
+    np.testing.assert_allclose(batch["steps"][..., 0], first_frames)
+    np.testing.assert_allclose(batch["steps"][..., 1:], 0, atol=1e-7)
 
 
 def test_augmentation_leaves_the_recording_alone():
-    sequence = encoded(random_planar(5))
-    scans, motions = sequence.scans.copy(), sequence.motions.copy()
-    Windows([sequence], FULL, 3, max_turn_bins=20).__getitems__([(0, 1, True), (1, 2, False)])
-    np.testing.assert_array_equal(sequence.scans, scans)
-    np.testing.assert_array_equal(sequence.motions, motions)
+    drive = encoded(random_planar(5))
+    scans, steps = drive.scans.copy(), drive.steps.copy()
+    Windows([drive], FULL, 3, max_turn_bins=20).__getitems__([(0, 1, True), (1, 2, False)])
+    np.testing.assert_array_equal(drive.scans, scans)
+    np.testing.assert_array_equal(drive.steps, steps)
 
 
 def drawn(lengths, window, seed=0, epoch=0, mirror=False):
@@ -177,18 +165,17 @@ def test_turned_half_circle_is_empty_where_nothing_was_seen(bins):
 
 def test_turned_window_has_exact_labels():
     planar = random_planar(9)
-    sequence = encoded(planar)
-    batch = Windows([sequence], FULL, 8, max_turn_bins=25).__getitems__([(0, 5, False)])
-    pairs, motions = batch["pairs"][0].numpy(), batch["motions"][0].numpy().astype(np.float64)
-    for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True)):
+    drive = encoded(planar)
+    batch = Windows([drive], FULL, 8, max_turn_bins=25).__getitems__([(0, 5, False)])
+    pairs, steps = batch["pairs"][0].numpy(), batch["steps"][0].numpy().astype(np.float64)
+    for number, (pair, step) in enumerate(zip(pairs, steps, strict=True)):
         np.testing.assert_allclose(pair[0], look(planar[number], FULL), rtol=1e-5)
-        pose = second_pose(planar[number : number + 2], motion)
-        np.testing.assert_allclose(pair[1], look(pose, FULL), rtol=1e-4)
-    turns = np.rad2deg(wrap(motions[:, 1] - sequence.motions[:, 1]))
+        np.testing.assert_allclose(pair[1], look(advance(planar[number], step), FULL), rtol=1e-4)
+    turns = np.rad2deg(wrap(steps[:, 2] - drive.steps[:, 2]))
     np.testing.assert_allclose(turns, turns.round(), atol=1e-4)
     assert len(set(turns.round())) > 3
     assert np.abs(turns).max() < 25.5
-    np.testing.assert_allclose(motions[:, 0], sequence.motions[:, 0], rtol=1e-6)
+    np.testing.assert_allclose(steps[:, :2], drive.steps[:, :2], rtol=1e-6)
 
 
 @pytest.mark.parametrize("sensor", [FULL, HALF])
@@ -196,14 +183,14 @@ def test_mirrored_window_is_a_drive_through_the_mirrored_room(sensor):
     planar = random_planar(6)
     mirrored = planar * [1, -1, -1]
     batch = Windows([encoded(planar, sensor=sensor)], sensor, 5).__getitems__([(0, 0, True)])
-    pairs, motions = batch["pairs"][0].numpy(), batch["motions"][0].numpy()
-    for number, (pair, motion) in enumerate(zip(pairs, motions, strict=True)):
+    pairs, steps = batch["pairs"][0].numpy(), batch["steps"][0].numpy().astype(np.float64)
+    for number, (pair, step) in enumerate(zip(pairs, steps, strict=True)):
         before, after = mirrored[number : number + 2]
         np.testing.assert_allclose(pair[0], look(before, sensor, MIRRORED_WALLS), rtol=1e-4)
         np.testing.assert_allclose(pair[1], look(after, sensor, MIRRORED_WALLS), rtol=1e-4)
-        step = (after[:2] - before[:2]) @ [np.cos(before[2]), np.sin(before[2])]
-        distance = np.sign(step) * np.hypot(*(after[:2] - before[:2]))
-        np.testing.assert_allclose(motion, [distance, wrap(after[2] - before[2])], atol=1e-5)
+        reached = advance(before, step)
+        np.testing.assert_allclose(reached[:2], after[:2], atol=1e-5)
+        np.testing.assert_allclose(wrap(reached[2] - after[2]), 0, atol=1e-5)
 
 
 def test_turned_and_mirrored_window_has_exact_labels():
@@ -211,9 +198,8 @@ def test_turned_and_mirrored_window_has_exact_labels():
     batch = Windows([encoded(planar)], FULL, 3, max_turn_bins=25).__getitems__([(0, 5, True)])
     mirrored = planar * [1, -1, -1]
     for number in range(3):
-        motion = batch["motions"][0, number].numpy().astype(np.float64)
-        pose = second_pose(mirrored[number : number + 2], motion)
-        expected = look(pose, FULL, MIRRORED_WALLS)
+        step = batch["steps"][0, number].numpy().astype(np.float64)
+        expected = look(advance(mirrored[number], step), FULL, MIRRORED_WALLS)
         np.testing.assert_allclose(batch["pairs"][0, number, 1], expected, rtol=1e-4)
 
 
@@ -250,15 +236,15 @@ def test_parts_do_not_overlap_and_leave_nothing_out():
     assert len(head) == round(0.85 * 41)
 
 
-def with_unknown(sequence, *frames):
-    sequence.poses[list(frames)] = np.nan
-    return sequence
+def with_unknown(drive, *frames):
+    drive.poses[list(frames)] = np.nan
+    return drive
 
 
 def test_unknown_truth_at_the_ends_is_cut():
     part = cut({"x": with_unknown(numbered(10), 0, 1, 9)}, "x")
     assert part.scans[:, 0].tolist() == [2, 3, 4, 5, 6, 7, 8]
-    assert np.isfinite(part.motions).all()
+    assert np.isfinite(part.steps).all()
 
 
 def test_unknown_truth_inside_is_refused_and_named():
@@ -276,15 +262,15 @@ def test_fewer_than_two_known_poses_are_refused(known):
 # --- the module ----------------------------------------------------------------------------------
 
 
-def read_room(name):
+def open_room(name):
     """A drive that looks at the room from the middle of every bin."""
     frames = {"long": 40, "short": 5}[name]
     planar = random_planar(frames, seed=frames)
     angles = np.deg2rad(np.arange(-180.0, 180.0))
     # A method of a list: the workers that encode need not import this file, and with it torch.
-    read_scan = [(angles, look(pose, FULL)[:-1].astype(np.float64)) for pose in planar].__getitem__
+    read_scan = [Scan(look(pose, FULL)[:-1].astype(np.float64), angles) for pose in planar].__getitem__
     stamps = np.arange(frames, dtype=np.float64)
-    return Sequence(name, planar_to_poses(planar), stamps, read_scan, fingerprint=name)
+    return Recording(name, planar_to_poses(planar), stamps, read_scan, fingerprint=name)
 
 
 @pytest.fixture(scope="module")
@@ -294,25 +280,25 @@ def cache(tmp_path_factory):
 
 def room_module(cache, train=("long",), val=("short",), test=("long[0.5:]", "short"), **options):
     options = {"workers": 1, **options}
-    return OdometryDataModule(read_room, list(train), list(val), list(test), FULL, cache, **options)
+    return OdometryDataModule(open_room, list(train), list(val), list(test), FULL, cache, **options)
 
 
 def test_module_reads_encodes_and_cuts(cache):
     module = room_module(cache).load()
-    assert [len(s) for split in ("train", "val", "test") for s in module.sequences[split]] == [40, 5, 20, 5]
+    assert [len(s) for split in ("train", "val", "test") for s in module.drives[split]] == [40, 5, 20, 5]
     planar = random_planar(40, seed=40)
     expected = np.stack([look(pose, FULL) for pose in planar])
-    np.testing.assert_allclose(module.sequences["train"][0].scans, expected, rtol=1e-5)
-    np.testing.assert_allclose(module.sequences["test"][0].scans, expected[20:], rtol=1e-5)
+    np.testing.assert_allclose(module.drives["train"][0].scans, expected, rtol=1e-5)
+    np.testing.assert_allclose(module.drives["test"][0].scans, expected[20:], rtol=1e-5)
 
 
 def test_validation_and_test_are_whole_drives_in_order(cache):
     module = room_module(cache, val=("short", "long[:0.5]")).load()
     for split, loader in (("val", module.val_dataloader()), ("test", module.test_dataloader())):
         items = list(loader)
-        assert [item["number"] for item in items] == [0, 1]
-        for item, sequence in zip(items, module.sequences[split], strict=True):
-            np.testing.assert_array_equal(item["scans"], sequence.scans)
+        assert [item["name"] for item in items] == module.names[split]
+        for item, drive in zip(items, module.drives[split], strict=True):
+            np.testing.assert_array_equal(item["scans"], drive.scans)
 
 
 def test_training_batches_have_the_asked_shape(cache):
@@ -325,27 +311,21 @@ def test_training_batches_have_the_asked_shape(cache):
 
 def test_turn_is_asked_for_in_degrees(cache):
     sensor = Sensor(0.5, 360.0, 40.0)
-    module = OdometryDataModule(read_room, [], [], [], sensor, cache, max_turn_deg=3.0)
+    module = OdometryDataModule(open_room, [], [], [], sensor, cache, max_turn_deg=3.0)
     assert module.max_turn_bins == 6
 
 
-def test_motion_statistics_are_those_of_the_training_drives(cache):
+def test_training_steps_are_those_of_the_training_drives(cache):
     module = room_module(cache, train=("short", "long[:0.25]")).load()
-    rows = []
-    for planar in (random_planar(5, seed=5), random_planar(40, seed=40)[:10]):
-        for (x, y, heading), (next_x, next_y, next_heading) in pairwise(planar):
-            dx, dy = next_x - x, next_y - y
-            forward = dx * np.cos(heading) + dy * np.sin(heading)
-            rows.append((np.copysign(np.hypot(dx, dy), forward), wrap(next_heading - heading)))
-    mean, deviation = module.motion_statistics()
-    np.testing.assert_allclose(mean, np.mean(rows, axis=0), atol=1e-9)
-    np.testing.assert_allclose(deviation, np.std(rows, axis=0), atol=1e-9)
-
-
-def test_deviation_of_constant_motion_is_not_zero():
-    module = room_module("unused")
-    module.sequences["train"] = [encoded(np.stack([np.arange(5.0), *np.zeros((2, 5))], axis=1))]
-    assert (module.motion_statistics()[1] > 0).all()
+    steps = module.training_steps()
+    drives = random_planar(5, seed=5), random_planar(40, seed=40)[:10]
+    befores, afters = (
+        np.concatenate([planar[part] for planar in drives]) for part in (slice(-1), slice(1, None))
+    )
+    assert steps.shape == (4 + 9, 3)
+    reached = np.stack([advance(*both) for both in zip(befores, steps, strict=True)])
+    np.testing.assert_allclose(reached[:, :2], afters[:, :2], atol=1e-9)
+    np.testing.assert_allclose(wrap(reached[:, 2] - afters[:, 2]), 0, atol=1e-9)
 
 
 def test_window_longer_than_a_training_drive_is_refused(cache):
@@ -362,4 +342,4 @@ def test_empty_split_is_refused(cache, split):
 
 def test_other_splits_need_not_be_given(cache):
     module = room_module(cache, train=(), val=()).load(("test",))
-    assert list(module.sequences) == ["test"]
+    assert list(module.drives) == ["test"]

@@ -15,11 +15,11 @@ from conftest import LENGTHS, ROOT, SMALL
 from data.make_kitti import make_kitti
 from evaluate import evaluate
 from rcnn_odom.errors import InputError
-from rcnn_odom.training import stages as experiment
+from rcnn_odom.evaluation.run_folder import BEST, LAST
+from rcnn_odom.training import stages
 from rcnn_odom.training.checkpoint import load_module
-from rcnn_odom.training.datamodule import Batches, WindowSampler
-from rcnn_odom.training.run_state import BEST, LAST
 from rcnn_odom.training.settings import plain
+from rcnn_odom.training.windows import Batches, WindowSampler
 from train import train
 
 FRAMES = {"00": 60, "03": 45, "10": 70, "09": 40, "08": 90, "05": 80, "07": 50, "06": 35}
@@ -37,9 +37,9 @@ def uneven(tmp_path_factory):
 
 def drift_of_one_process(module, settings, split):
     """Validation or test drift of a network, in this process alone."""
-    data = experiment.build_datamodule(settings).load((split,))
-    data.sequences["val"] = data.sequences[split]
-    trainer = experiment.build_trainer(
+    data = stages.build_datamodule(settings).load((split,))
+    data.drives["val"] = data.drives[split]
+    trainer = stages.build_trainer(
         settings | {"trainer": settings["trainer"] | {"devices": 1, "strategy": "auto"}}
     )
     [scores] = trainer.validate(module, data, verbose=False)

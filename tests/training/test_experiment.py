@@ -19,10 +19,11 @@ from evaluate import evaluate
 from rcnn_odom import cli
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import travelled
-from rcnn_odom.training import stages as experiment
+from rcnn_odom.evaluation.run_folder import BEST, LAST
+from rcnn_odom.training import stages
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 from rcnn_odom.training.modules import OdometryModule
-from rcnn_odom.training.run_state import BEST, LAST, fingerprint
+from rcnn_odom.training.run_state import settings_fingerprint
 from rcnn_odom.training.settings import plain
 from train import train
 
@@ -33,7 +34,7 @@ VARIANTS = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
 def test_a_run_leaves_everything_behind(configure, kitti, tmp_path, variant):
     metrics = train(configure(f"model={variant}", *kitti))
     run = tmp_path / "outputs" / "run"
-    assert (tmp_path / "outputs" / "latest").resolve() == run
+    assert (tmp_path / "outputs" / "latest" / "config.yaml").resolve().parent == run
     assert json.loads((run / "metrics.json").read_text()) == metrics
     assert yaml.safe_load((run / "config.yaml").read_text())["model"]["variant"] == variant
     assert (run / BEST).exists()
@@ -123,9 +124,9 @@ def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(configure, ki
         )
         after = torch.load(tmp_path / "outputs" / run / BEST, weights_only=True)["state_dict"]
         same = [
-            torch.equal(after[key.replace("network.", "network.cnn.")], weights[key])
+            torch.equal(after[key.replace("model.", "model.cnn.")], weights[key])
             for key in weights
-            if "network" in key
+            if "encoder" in key or "head" in key
         ]
         assert all(same) == freeze
 
@@ -173,7 +174,7 @@ def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, mo
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.TrainingLog, "on_train_epoch_start", stop, raising=False)
+        patch.setattr(stages.TrainingLog, "on_train_epoch_start", stop, raising=False)
         with pytest.raises(KeyboardInterrupt):
             train(configure("model=cnn_reg", *kitti))
     assert f"the same command goes on from what is in {tmp_path}/outputs/run" in caplog.text
@@ -218,11 +219,11 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
         ("trainer.precision=32", "choose one of auto, bf16-mixed, 32-true"),
         ("trainer.gradient_clip_val=0", "must be null, which clips nothing"),
         ("trainer.accelerator=abacus", "accelerator=cpu"),
-        ("data.lengths=100", "must list lengths"),
+        ("data.lengths=100", "must be a list of lengths"),
         ("data.ring=abc", "must be null or a whole number"),
         ("data.ring=9", "data.ring must be 0 to 3"),
         ("trainer.devices=2", "trainer=ddp trainer.devices"),
-        ("data.train=00", "must list sequences"),
+        ("data.train=00", "must be a list of sequences"),
         ("data.val=['10','10']", "each once"),
         ("data.sensor.max_range=far", "must be a number above 0"),
         ("data.augment.mirror=maybe", "must be true or false"),
@@ -233,7 +234,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure,
         ("seed=-1", "not negative"),
         ("model.epochs=true", "whole number above 0"),
         ("model.window=60", "training sequence 00 has 60 frames, a window needs 61"),
-        ("data.train=[]", "must list sequences"),
+        ("data.train=[]", "must be a list of sequences"),
         ("data.val=['10[0.9:0.1]']", "two fractions"),
         ("data.val=['10[0.99:]']", "two are needed"),
         ("model.pooling=median", "choose one of avg, max"),
@@ -259,7 +260,8 @@ def test_bad_input_leaves_latest_where_it_was(configure, kitti, tmp_path):
     train(configure("model=cnn_reg", *kitti, run="good"))
     with pytest.raises(InputError):
         train(configure("model=cnn_reg", *kitti, "data.root=nowhere", run="bad"))
-    assert (tmp_path / "outputs" / "latest").resolve() == tmp_path / "outputs" / "good"
+    latest = tmp_path / "outputs" / "latest" / "config.yaml"
+    assert latest.resolve().parent == tmp_path / "outputs" / "good"
 
 
 def test_parts_of_one_drive_have_files_of_their_own(configure, kitti, tmp_path):
@@ -274,7 +276,7 @@ def test_moving_a_drive_from_training_to_validation_asks_for_another_first_stage
         ["data.train=['00']", "data.val=['10','05']"],
     ):
         settings = plain(configure("model=cnn_cls", *kitti, *split))
-        prints.add(fingerprint(settings, experiment.build_datamodule(settings).load(("train", "val"))))
+        prints.add(settings_fingerprint(settings, stages.build_datamodule(settings).load(("train", "val"))))
     assert len(prints) == 2
 
 
@@ -284,6 +286,12 @@ def test_training_in_bf16_learns_a_drive_by_heart(configure, kitti, augmented):
     options += [f"data.augment.mirror={augmented}", f"data.augment.max_turn_deg={int(augmented == 'true')}"]
     metrics = train(configure("model=cnn_reg", *kitti, *options))
     assert metrics["test"]["drift"] < metrics["baselines"]["mean_motion"]["drift"] / 2
+
+
+def test_a_model_that_does_not_train_is_refused(configure, kitti):
+    settings = plain(configure("model=cnn_reg", *kitti)) | {"model": {"variant": "icp"}}
+    with pytest.raises(InputError, match=r"^model=icp has nothing to train; score it: .*model=icp data="):
+        stages.train(settings)
 
 
 def test_training_that_diverges_says_so(configure, kitti):
@@ -297,7 +305,7 @@ def test_training_that_diverges_says_so(configure, kitti):
 
 STUB = [
     "data=simulated",
-    "data.reader._target_=stub_drives.read",
+    "data.reader.format=stub_drives",
     "data.train=['00','02']",
     "data.test=['05']",
     "data.sensor.max_range=40.0",
@@ -332,7 +340,7 @@ def test_stopped_run_on_fresh_worlds_goes_on_with_the_same_worlds(configure, tmp
             raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(experiment.TrainingLog, "on_train_epoch_start", stop, raising=False)
+        patch.setattr(stages.TrainingLog, "on_train_epoch_start", stop, raising=False)
         with pytest.raises(KeyboardInterrupt):
             train(configure("model=cnn_reg", *FRESH))
     assert multiprocessing.active_children() == []
@@ -343,21 +351,39 @@ def test_stopped_run_on_fresh_worlds_goes_on_with_the_same_worlds(configure, tmp
     assert len(list((tmp_path / "outputs" / "cache").glob("*.npy"))) == 4, "the new worlds leave no file"
 
 
-def test_no_stage_sees_the_new_worlds_of_the_other(configure, monkeypatch):
+@pytest.fixture
+def worlds_seen(monkeypatch):
+    """Fills with the names of the drives of each epoch."""
     seen = []
-    of = FreshWorlds.of
+    drives_of = FreshWorlds.drives_of
 
     def remember(self, epoch):
-        drives = of(self, epoch)
+        drives = drives_of(self, epoch)
         seen.append({drive.name for drive in drives})
         return drives
 
-    monkeypatch.setattr(FreshWorlds, "of", remember)
+    monkeypatch.setattr(FreshWorlds, "drives_of", remember)
+    return seen
+
+
+def test_no_stage_sees_the_new_worlds_of_the_other(configure, worlds_seen):
     train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=3"))
-    assert len(seen) == 5
-    new = [names for names in seen if all("~" in name for name in names)]
+    assert len(worlds_seen) == 5
+    new = [names for names in worlds_seen if all("~" in name for name in names)]
     assert len(new) == 3, "each stage begins with the training set itself"
     assert len(set.union(*new)) == sum(map(len, new))
+
+
+def test_a_given_first_stage_keeps_its_new_worlds_for_itself(configure, tmp_path, worlds_seen):
+    train(configure("model=cnn_cls", *FRESH, "model.epochs=4", run="cnn"))
+    given = f"model.pretrained={tmp_path / 'outputs' / 'cnn' / BEST}"
+    train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=1", given))
+    assert [sorted(names) for names in worlds_seen] == [
+        ["00", "02"],
+        *([f"00~{epoch}", f"02~{epoch}"] for epoch in (1, 2, 3)),
+        ["00", "02"],
+        ["00~5", "02~5"],
+    ]
 
 
 @pytest.mark.parametrize(
@@ -368,7 +394,7 @@ def test_a_training_on_other_new_worlds_is_another_one(configure, option):
     prints = set()
     for flag in ("true", "false"):
         settings = plain(configure("model=cnn_cls", *FRESH, f"data.{option}={flag}"))
-        prints.add(fingerprint(settings, experiment.build_datamodule(settings).load(("train", "val"))))
+        prints.add(settings_fingerprint(settings, stages.build_datamodule(settings).load(("train", "val"))))
     assert len(prints) == 2
 
 
@@ -396,9 +422,9 @@ def test_simulated_drives_train_on_fresh_worlds(configure):
 
 @pytest.mark.parametrize("scale", ["small", "full"])
 def test_shipped_simulation_has_long_drives_to_score(configure, scale):
-    module = experiment.build_datamodule(plain(configure("data=simulated", f"data.scale={scale}")))
+    module = stages.build_datamodule(plain(configure("data=simulated", f"data.scale={scale}")))
     for name in (*module.names["val"], *module.names["test"]):
-        assert travelled(module.read(name).poses)[-1] > 400
+        assert travelled(module.open_recording(name).poses)[-1] > 400
 
 
 @pytest.mark.parametrize(
@@ -406,9 +432,9 @@ def test_shipped_simulation_has_long_drives_to_score(configure, scale):
     [
         (["data=simulated"], [50, 20]),
         (["data=simulated", "data.scale=full"], [10, 5]),
-        (["data=simulated", "data.passes.small.cnn=3"], [3, 20]),
         (["data=kitti", "data.root=x"], [10, 5]),
-        (["data=kitti", "data.root=x", "data.epochs.cnn=3"], [3, 5]),
+        (["data=indoor", "data.scale=full"], [10, 5]),
+        (["data=carmen", "data.root=x", "data.name=mine"], [10, 5]),
     ],
 )
 def test_small_training_set_has_more_epochs(options, epochs):
@@ -428,9 +454,9 @@ def test_small_training_set_has_more_epochs(options, epochs):
         ("data.world_seed=abc", "data.world_seed=abc: must be a whole number, not negative"),
         ("data.fresh_worlds=maybe", "data.fresh_worlds=maybe: must be true or false"),
         ("data.realism.tilt=1", "data.realism.tilt=1: must be true or false"),
-        ("data.sensor=3", "data.sensor=3: has parts to set, for instance data.sensor.max_range=40"),
+        ("data.sensor=3", "data.sensor=3: has parts to set, for instance data.sensor.max_range=..."),
         ("data.realism=false", "data.realism=False: has parts to set"),
-        ("data.passes.small.cnn=0", "data.passes.small.cnn=0: must be a whole number above 0"),
+        ("+data.passes.small.cnn=3", "data.passes has become model.epochs and model.first_stage.epochs"),
     ],
 )
 def test_bad_options_of_the_simulation_are_named(configure, option, message):

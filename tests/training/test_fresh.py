@@ -9,15 +9,15 @@ from functools import partial
 import numpy as np
 import pytest
 import torch
-from test_cache import running, wait_for
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import relative_motions
-from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.recordings.cache import encode_sequences
+from rcnn_odom.geometry import relative_steps
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.fresh_worlds import FreshWorlds
-from stub_drives import read
+from recordings.test_cache import running, wait_for
+from stub_drives import load
 
 torch.set_num_threads(1)
 SENSOR = Sensor(1.0, 180.0, 40.0)
@@ -26,7 +26,7 @@ NAMES = ["00", "02"]
 
 @pytest.fixture(scope="module")
 def training_set(tmp_path_factory):
-    return encode_sequences([read(name) for name in NAMES], SENSOR, tmp_path_factory.mktemp("cache"), 1)
+    return encode_recordings([load(name) for name in NAMES], SENSOR, tmp_path_factory.mktemp("cache"), 1)
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def make_worlds(training_set, tmp_path):
 
     def make_worlds(epochs=4, workers=1, **options):
         folder = tmp_path / f"worlds{len(made)}"
-        made.append(FreshWorlds(partial(read, **options), training_set, epochs, SENSOR, workers, folder))
+        made.append(FreshWorlds(partial(load, **options), training_set, epochs, SENSOR, workers, folder))
         return made[-1]
 
     yield make_worlds
@@ -44,16 +44,16 @@ def make_worlds(training_set, tmp_path):
 
 
 def test_kept_worlds_are_the_same_and_made_once(training_set, tmp_path):
-    fresh = FreshWorlds(read, training_set, 3, SENSOR, 1, tmp_path / "passing")
-    keeping = FreshWorlds(read, training_set, 3, SENSOR, 1, tmp_path, keep=True)
+    fresh = FreshWorlds(load, training_set, 3, SENSOR, 1, tmp_path / "passing")
+    keeping = FreshWorlds(load, training_set, 3, SENSOR, 1, tmp_path, keep=True)
     again = FreshWorlds(unreadable_scans, training_set, 3, SENSOR, 1, tmp_path, keep=True)
     try:
         for epoch in (1, 2):
-            for expected, kept in zip(fresh.of(epoch), keeping.of(epoch), strict=True):
+            for expected, kept in zip(fresh.drives_of(epoch), keeping.drives_of(epoch), strict=True):
                 np.testing.assert_array_equal(kept.scans, expected.scans)
                 np.testing.assert_array_equal(kept.poses, expected.poses)
         # Another training finds them all, and starts no process.
-        assert [drive.name for drive in again.of(1)] == [f"{name}~1" for name in NAMES]
+        assert [drive.name for drive in again.drives_of(1)] == [f"{name}~1" for name in NAMES]
         assert again._workers is None
     finally:
         for worlds in (fresh, keeping, again):
@@ -64,7 +64,7 @@ def unreadable_scans(name):
     def read_scan(frame):
         raise AssertionError(f"{name} should come from the cache")
 
-    return replace(read(name), read_scan=read_scan)
+    return replace(load(name), read_scan=read_scan)
 
 
 def processes(worlds):
@@ -73,63 +73,63 @@ def processes(worlds):
 
 def test_epoch_has_the_drives_of_its_number(make_worlds, training_set):
     worlds = make_worlds()
-    assert worlds.of(0) == training_set
+    assert worlds.drives_of(0) == training_set
     for epoch in (1, 2, 3):
-        drives = worlds.of(epoch)
+        drives = worlds.drives_of(epoch)
         assert [drive.name for drive in drives] == [f"{name}~{epoch}" for name in NAMES]
         for drive in drives:
-            sequence = read(drive.name)
-            direct = [encode(*sequence.read_scan(frame), SENSOR) for frame in range(len(sequence))]
+            recording = load(drive.name)
+            direct = [SENSOR.encode(recording.read_scan(frame)) for frame in range(len(recording))]
             np.testing.assert_array_equal(drive.scans, direct)
-            np.testing.assert_array_equal(drive.motions, relative_motions(sequence.poses))
+            np.testing.assert_array_equal(drive.steps, relative_steps(recording.poses))
 
 
 def test_epoch_is_the_same_for_a_resumed_run_and_any_number_of_workers(make_worlds):
     slow, resumed = make_worlds(workers=1), make_worlds(workers=3)
     for epoch in (0, 1):
-        slow.of(epoch)
+        slow.drives_of(epoch)
     for epoch in (2, 2, 3):  # asked twice, it is the same
-        for one, other in zip(slow.of(epoch), resumed.of(epoch), strict=True):
+        for one, other in zip(slow.drives_of(epoch), resumed.drives_of(epoch), strict=True):
             assert one.name == other.name
             np.testing.assert_array_equal(one.scans, other.scans)
-            np.testing.assert_array_equal(one.motions, other.motions)
+            np.testing.assert_array_equal(one.steps, other.steps)
 
 
 def test_only_the_present_and_the_next_epoch_are_kept_and_none_after_the_last(make_worlds):
     worlds = make_worlds(epochs=3)
     kept = []
     for epoch in range(3):
-        worlds.of(epoch)
+        worlds.drives_of(epoch)
         for made in worlds._made.values():
             made.result()
         kept.append(sorted(path.name.split("-")[0] for path in worlds.folder.glob("*.npy")))
     assert kept == [["00~1", "02~1"], ["00~1", "00~2", "02~1", "02~2"], ["00~2", "02~2"]]
     alone = make_worlds(epochs=1)
-    alone.of(0)
+    alone.drives_of(0)
     assert alone._workers is None
 
 
 def test_time_for_which_training_waits_is_measured(make_worlds):
     worlds = make_worlds(seconds=0.002)
-    worlds.of(0)
+    worlds.drives_of(0)
     assert worlds.waited < 0.1
-    worlds.of(1)
+    worlds.drives_of(1)
     assert worlds.waited > 0.2
     worlds._made[2].result()
-    worlds.of(2)
+    worlds.drives_of(2)
     assert worlds.waited < 0.1
 
 
 def test_drive_that_cannot_be_made_stops_training(make_worlds):
     worlds = make_worlds(broken="02~1")
-    worlds.of(0)
+    worlds.drives_of(0)
     with pytest.raises(InputError, match="02~1: frame 20 is damaged"):
-        worlds.of(1)
+        worlds.drives_of(1)
 
 
 def test_closing_ends_the_workers_at_once(make_worlds):
     worlds = make_worlds(workers=2, seconds=10)
-    worlds.of(0)
+    worlds.drives_of(0)
     assert len(processes(worlds)) == 2
     start = time.monotonic()
     worlds.close()
@@ -145,13 +145,13 @@ import time
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from stub_drives import read
-from rcnn_odom.recordings.cache import encode_sequences
+from stub_drives import load
+from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 from rcnn_odom.models.encoding import Sensor
 if __name__ == "__main__":
-    drives = encode_sequences([read("00")], Sensor(), Path("cache"), 1)
-    FreshWorlds(partial(read, seconds=0.01), drives, 1000, Sensor(), 2, Path("worlds")).of(0)
+    drives = encode_recordings([load("00")], Sensor(), Path("cache"), 1)
+    FreshWorlds(partial(load, seconds=0.01), drives, 1000, Sensor(), 2, Path("worlds")).drives_of(0)
     print("made", flush=True)
     time.sleep(60)
 """)
@@ -176,30 +176,30 @@ if __name__ == "__main__":
 
 def make_module(folder, train=NAMES, fresh_epochs=3, **options):
     options = {"workers": 1, "fresh_epochs": fresh_epochs, "worlds_dir": folder / "worlds", **options}
-    return OdometryDataModule(read, list(train), ["10"], ["05"], SENSOR, folder, **options)
+    return OdometryDataModule(load, list(train), ["10"], ["05"], SENSOR, folder, **options)
 
 
 @pytest.mark.parametrize("window", [1, 16])
 def test_batches_of_an_epoch_come_from_its_worlds(tmp_path, window):
     fresh = make_module(tmp_path, window=window, batch_size=4).load()
     fixed = make_module(tmp_path, window=window, batch_size=4, fresh_epochs=0).load()
-    statistics = fresh.motion_statistics()
+    steps = fresh.training_steps()
     fresh_loader, fixed_loader = fresh.train_dataloader(), fixed.train_dataloader()
     try:
         for epoch in range(3):
             for loader in (fresh_loader, fixed_loader):
                 loader.batch_sampler.sampler.set_epoch(epoch)
             if epoch:  # the same draws, out of other drives
-                fixed_loader.dataset.sequences = encode_sequences(
-                    [read(f"{name}~{epoch}") for name in NAMES], SENSOR, tmp_path / "other", 1
+                fixed_loader.dataset.drives = encode_recordings(
+                    [load(f"{name}~{epoch}") for name in NAMES], SENSOR, tmp_path / "other", 1
                 )
             batches = list(zip(fresh_loader, fixed_loader, strict=True))
             assert len(batches) == len(fresh_loader)
             for one, other in batches:
                 assert torch.equal(one["pairs"], other["pairs"])
-                assert torch.equal(one["motions"], other["motions"])
-        np.testing.assert_array_equal(fresh.motion_statistics(), statistics)
-        assert [drive.name for drive in fresh.sequences["train"]] == NAMES
+                assert torch.equal(one["steps"], other["steps"])
+        np.testing.assert_array_equal(fresh.training_steps(), steps)
+        assert [drive.name for drive in fresh.drives["train"]] == NAMES
         assert len(list(tmp_path.glob("*.npy"))) == 4
     finally:
         fresh.close()
@@ -209,22 +209,22 @@ def test_batches_of_an_epoch_come_from_its_worlds(tmp_path, window):
 def test_part_of_a_drive_has_no_new_worlds(tmp_path):
     with pytest.raises(InputError, match=r"data.train=00\[:0.5\]: new worlds come as whole drives"):
         make_module(tmp_path, train=["00[:0.5]"]).load()
-    assert len(make_module(tmp_path, train=["00[:0.5]"], fresh_epochs=0).load().sequences["train"][0]) == 75
+    assert len(make_module(tmp_path, train=["00[:0.5]"], fresh_epochs=0).load().drives["train"][0]) == 75
 
 
 MEMORY = """
 import sys
 from functools import partial
 from pathlib import Path
-from rcnn_odom.recordings.cache import encode_sequences
+from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.models.encoding import Sensor
-from stub_drives import read
+from stub_drives import load
 if __name__ == "__main__":
     names = [f"{number:03d}" for number in range(int(sys.argv[1]))]
     folder = Path(sys.argv[2])
     options = {"workers": 1, "fresh_epochs": 2, "worlds_dir": folder / "worlds"}
-    drives = partial(read, frames=150)
+    drives = partial(load, frames=150)
     data = OdometryDataModule(drives, names, ["10"], ["05"], Sensor(), folder, **options).load()
     loader = data.train_dataloader()
     for epoch in range(2):

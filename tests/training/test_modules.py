@@ -1,4 +1,4 @@
-"""The four variants: training, estimating whole drives, checkpoints."""
+"""Modules: training, estimating whole drives, checkpoints."""
 
 import io
 import os
@@ -9,46 +9,32 @@ import numpy as np
 import pytest
 import torch
 
+from odometry import DEVIATION, MEAN, NAMES, SENSOR, motions_like, options
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FORWARD_CAMERA, compose
+from rcnn_odom.geometry import FORWARD_CAMERA, compose, motions_of
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.models.two_numbers import steps_of
+from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.training import modules
 from rcnn_odom.training.checkpoint import load_module
-from rcnn_odom.training.datamodule import OdometryDataModule, Windows
-from rcnn_odom.training.modules import VARIANTS, CNNClassification
+from rcnn_odom.training.datamodule import OdometryDataModule
+from rcnn_odom.training.modules import OdometryModule, module_for
+from rcnn_odom.training.windows import Windows
 
 torch.set_num_threads(1)
-NAMES = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
-SENSOR = Sensor(1.0, 180.0, 40.0)
-SCORING = {"lengths": [5.0, 10.0], "apply": "end"}
-MEAN, DEVIATION = np.array([0.5, 0.01]), np.array([0.2, 0.03])
-
-
-def settings(variant, **changes):
-    model = {
-        "variant": variant,
-        "kernel_size": 3,
-        "pooling": "avg",
-        "angle": "expectation",
-        "dropout": 0.0,
-        "rotation_classes": {"count": 112, "width_deg": 0.1},
-        "beta": 1.0 if variant.endswith("cls") else 100.0,
-        "per_sample_norm": False,
-        "epochs": 2,
-        "learning_rate": 1e-3,
-        "window": 1,
-        "batch_size": 8,
-    }
-    if variant.startswith("rcnn"):
-        model |= {"hidden_size": 12, "layers": 2, "projection": None, "freeze": False}
-        model |= {"window": 5, "batch_size": 4}
-    return {**model, **changes}
+LENGTHS = [5.0, 10.0]
+NAMED = [
+    modules.CNNRegression,
+    modules.CNNClassification,
+    modules.RCNNRegression,
+    modules.RCNNClassification,
+]
 
 
 def build(variant, seed=0, sensor=SENSOR, **changes):
     torch.manual_seed(seed)
-    module = VARIANTS[variant](settings(variant, **changes), sensor.as_dict(), SCORING)
-    module.set_motion_statistics(MEAN, DEVIATION)
+    module = module_for(variant)(options(variant, **changes), sensor.as_dict(), LENGTHS)
+    module.set_units(steps_of(motions_like(MEAN, DEVIATION), "middle"))
     return module
 
 
@@ -59,16 +45,15 @@ def random_scans(frames, seed=0):
 def small_data(module, frames=60):
     rng = np.random.default_rng(0)
 
-    def sequence(name):
+    def drive(name):
         motions = np.stack([rng.normal(0.5, 0.2, frames - 1), rng.normal(0.01, 0.03, frames - 1)], axis=1)
         scans = rng.uniform(0, 40, (frames, 181)).astype(np.float32)
-        return EncodedSequence(name, name, scans, compose(motions), np.arange(float(frames)), FORWARD_CAMERA)
+        poses = compose(steps_of(motions, "start"))
+        return Drive(name, name, scans, poses, np.arange(float(frames)), FORWARD_CAMERA)
 
-    model = module.model
-    data = OdometryDataModule(
-        None, ["a"], ["b"], ["c"], SENSOR, "unused", window=model["window"], batch_size=model["batch_size"]
-    )
-    data.sequences = {split: [sequence(split)] for split in ("train", "val", "test")}
+    recipe = {name: module.model.options[name] for name in ("window", "batch_size")}
+    data = OdometryDataModule(None, ["a"], ["b"], ["c"], SENSOR, "unused", **recipe)
+    data.drives = {split: [drive(split)] for split in ("train", "val", "test")}
     return data
 
 
@@ -128,19 +113,19 @@ def test_loss_is_that_of_the_paper(variant):
     module = build(variant)
     rng = np.random.default_rng(1)
     pairs = rng.uniform(0, 40, (3, 5, 2, 181)).astype(np.float32)
-    truth = rng.normal([0.5, 0.0], [0.2, 0.08], (3, 5, 2)).astype(np.float32)
-    batch = {"pairs": torch.from_numpy(pairs), "motions": torch.from_numpy(truth), "frames": torch.arange(3)}
+    steps = rng.normal([0.5, 0.0, 0.0], [0.2, 0.1, 0.08], (3, 5, 3)).astype(np.float32)
+    batch = {"pairs": torch.from_numpy(pairs), "steps": torch.from_numpy(steps), "frames": torch.arange(3)}
     outputs = module.training_step(batch, 0)
+    assert "diverged" not in outputs
+    truth = motions_of(steps)
     with torch.no_grad():
-        estimate, _ = module.network(torch.from_numpy(pairs))
+        estimate, _ = module.model.motions(torch.from_numpy(pairs))
     error = estimate.motion.numpy().astype(np.float64) - truth
     distance, rotation = np.sqrt((error**2).mean((0, 1)))
     if variant.endswith("cls"):
         scores = estimate.scores.numpy().astype(np.float64)
         share = np.exp(scores) / np.exp(scores).sum(-1, keepdims=True)
-        number = np.clip(np.floor(np.degrees(truth[..., 1].astype(np.float64)) / 0.1) + 56, 0, 111).astype(
-            int
-        )
+        number = np.clip(np.floor(np.degrees(truth[..., 1]) / 0.1) + 56, 0, 111).astype(int)
         rotation = -np.log(np.take_along_axis(share, number[..., None], -1)).mean()
         outside = (np.abs(np.degrees(truth[..., 1])) > 5.6).mean()
         assert outputs["headings_outside_classes"].item() == pytest.approx(outside)
@@ -170,15 +155,24 @@ def test_every_epoch_draws_other_windows(monkeypatch):
 @pytest.mark.parametrize("freeze", [False, True])
 def test_first_stage_is_taken_over_and_frozen_if_asked_for(freeze):
     cnn, module = build("cnn_cls", seed=5), build("rcnn_reg", seed=6, freeze=freeze)
-    assert isinstance(cnn, CNNClassification)
-    cnn.set_motion_statistics(MEAN + 1, DEVIATION * 2)
-    module.load_first_stage(cnn)
+    cnn.set_units(steps_of(motions_like(MEAN + 1, DEVIATION * 2), "middle"))
+    module.model.take_first_stage(cnn.model)
     scans = random_scans(9)
     pairs = torch.stack([scans[:-1], scans[1:]], 1)[None]
-    torch.testing.assert_close(module.network.cnn(pairs)[0].motion, cnn.network(pairs)[0].motion)
+    taken, given = (model.motions(pairs)[0] for model in (module.model, cnn.model))
+    torch.testing.assert_close(taken.first_stage, given.motion)
     small_trainer(1).fit(module, datamodule=small_data(module))
-    same = [torch.equal(a, b) for a, b in zip(module.network.cnn.parameters(), cnn.parameters(), strict=True)]
+    pair = module.model.cnn.parameters(), cnn.model.parameters()
+    same = [torch.equal(a, b) for a, b in zip(*pair, strict=True)]
     assert all(same) if freeze else not any(same)
+
+
+def test_units_of_training_drives_with_one_step_alone_are_not_zero():
+    module = build("rcnn_reg")
+    module.set_units(np.tile([1.0, 0.2, 0.0], (4, 1)))
+    np.testing.assert_allclose(module.mean_step, [1.0, 0.2, 0.0], rtol=1e-6)
+    for head in (module.model.head, module.model.cnn.head):
+        assert (head.deviation > 0).all()
 
 
 # --- estimating ----------------------------------------------------------------------------------
@@ -186,47 +180,51 @@ def test_first_stage_is_taken_over_and_frozen_if_asked_for(freeze):
 
 def in_one_pass(module, scans):
     with torch.no_grad():
-        estimate, _ = module.network(torch.stack([scans[:-1], scans[1:]], 1)[None])
-    return estimate.motion[0].double().numpy()
+        steps, _, _ = module.model(torch.stack([scans[:-1], scans[1:]], 1)[None])
+    return steps[0].double().numpy()
+
+
+def estimate(module, scans):
+    return module.model.estimate_scans(scans).values
 
 
 @pytest.mark.parametrize("variant", NAMES)
 @pytest.mark.parametrize("frames", [2, 64, 65, 66, 129, 155])
 def test_estimate_equals_a_single_pass(variant, frames):
     module, scans = build(variant).eval(), random_scans(frames)
-    motions = module.estimate(scans).motions
-    assert motions.shape == (frames - 1, 2)
-    assert motions.dtype == np.float64
-    np.testing.assert_allclose(motions, in_one_pass(module, scans), atol=1e-5)
+    steps = estimate(module, scans)
+    assert steps.shape == (frames - 1, 3)
+    assert steps.dtype == np.float64
+    np.testing.assert_allclose(steps, in_one_pass(module, scans), atol=1e-5)
 
 
 @pytest.mark.parametrize("variant", ["rcnn_reg", "rcnn_cls"])
 def test_lstm_remembers_across_the_chunk_border(variant):
     module, scans = build(variant).eval(), random_scans(155)
-    whole = module.estimate(scans).motions
+    whole = estimate(module, scans)
     # The second chunk begins with frame 64: alone it would know nothing of those before.
-    alone = module.estimate(scans[64:]).motions
+    alone = estimate(module, scans[64:])
     assert np.abs(alone[0] - whole[64]).max() > 1e-4
     changed = scans.clone()
     changed[60] = 0
-    assert np.abs(module.estimate(changed).motions[64:66] - whole[64:66]).max() > 1e-6
+    assert np.abs(estimate(module, changed)[64:66] - whole[64:66]).max() > 1e-6
 
 
 @pytest.mark.parametrize("variant", NAMES)
 def test_estimate_has_no_memory_between_drives(variant):
     module, scans = build(variant).eval(), random_scans(20)
-    first = module.estimate(scans).motions
-    module.estimate(random_scans(30, seed=1))
-    np.testing.assert_array_equal(module.estimate(scans).motions, first)
+    first = estimate(module, scans)
+    estimate(module, random_scans(30, seed=1))
+    np.testing.assert_array_equal(estimate(module, scans), first)
 
 
 @pytest.mark.parametrize("variant", NAMES)
 def test_training_mode_and_autocast_do_not_change_estimates(variant):
     module, scans = build(variant), random_scans(70)
-    expected = module.eval().estimate(scans).motions
-    np.testing.assert_array_equal(module.train().estimate(scans).motions, expected)
+    expected = estimate(module.eval(), scans)
+    np.testing.assert_array_equal(estimate(module.train(), scans), expected)
     with torch.autocast("cpu", torch.bfloat16):
-        np.testing.assert_array_equal(module.estimate(scans).motions, expected)
+        np.testing.assert_array_equal(estimate(module, scans), expected)
 
 
 @pytest.mark.filterwarnings("ignore")
@@ -235,8 +233,9 @@ def test_trainers_test_gives_the_estimates_of_each_drive(variant):
     module = build(variant)
     data = small_data(module)
     small_trainer().test(module, datamodule=data, verbose=False)
-    expected = in_one_pass(module, torch.from_numpy(data.sequences["test"][0].scans))
-    np.testing.assert_allclose(module.estimates[0].motions, expected, atol=1e-5)
+    expected = in_one_pass(module, torch.from_numpy(data.drives["test"][0].scans))
+    assert list(module.estimates) == ["test"]
+    np.testing.assert_allclose(module.estimates["test"].values, expected, atol=1e-5)
 
 
 # --- checkpoints ---------------------------------------------------------------------------------
@@ -247,11 +246,75 @@ def test_checkpoint_gives_the_same_estimates(tmp_path, variant):
     module, scans = build(variant), random_scans(70)
     path = save(module, tmp_path / "best.ckpt")
     loaded = load_module(path, variant, SENSOR)
-    assert type(loaded) is VARIANTS[variant]
+    assert type(loaded) is NAMED[NAMES.index(variant)]
+    assert loaded.variant == loaded.model.name == variant
     assert not loaded.training
-    assert loaded.model == module.model
-    assert loaded.scoring == SCORING
-    np.testing.assert_array_equal(loaded.estimate(scans).motions, module.eval().estimate(scans).motions)
+    assert loaded.model.options == module.model.options
+    assert loaded.lengths == LENGTHS
+    np.testing.assert_array_equal(estimate(loaded, scans), estimate(module.eval(), scans))
+    np.testing.assert_array_equal(loaded.mean_step, module.mean_step)
+
+
+def as_of_old(path, module):
+    """A checkpoint as version 0.1 wrote it: other names, and less known."""
+    saved = torch.load(save(module, path), weights_only=True)
+    weights = {}
+    for name, value in saved["state_dict"].items():
+        name = name.removeprefix("model.")
+        if name in ("least_filled", "period"):
+            weights[f"uncertainty.{name}"] = value
+        elif name == "uncertainty.weights":
+            weights[name] = value
+        elif name.split(".")[0] in ("encoder", "head", "cnn", "lstm", "projection"):
+            weights[f"network.{name}"] = value
+        else:
+            assert name in ("mean_step", "typical_step", "uncertainty.lateral")
+    settings = saved["hyper_parameters"]
+    model = {key: value for key, value in settings["model"].items() if key != "apply"}
+    saved["hyper_parameters"] = {
+        "variant": settings["variant"],
+        "model": {"variant": settings["variant"], **model},
+        "sensor": settings["sensor"],
+        "scoring": {"lengths": settings["lengths"], "apply": settings["model"]["apply"]},
+    }
+    torch.save({**saved, "state_dict": weights}, path)
+    return path
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_checkpoint_of_an_older_version_gives_the_same_estimates(tmp_path, variant):
+    module, scans = build(variant, apply="end").eval(), random_scans(70)
+    module.model.uncertainty.weights.fill_(0.1)
+    module.model.least_filled.fill_(0.3)
+    module.model.period.fill_(0.2)
+    loaded = load_module(as_of_old(tmp_path / "old.ckpt", module), variant, SENSOR)
+    np.testing.assert_array_equal(estimate(loaded, scans), estimate(module, scans))
+    assert loaded.lengths == LENGTHS
+    assert loaded.model.options["apply"] == "end"
+    assert "variant" not in loaded.model.options
+    assert [float(loaded.model.least_filled), float(loaded.model.period)] == pytest.approx([0.3, 0.2])
+    # Only what two numbers say is known: no variance but the heading's, and no sideways part.
+    covariances = loaded.model.estimate_scans(scans).covariances
+    expected = module.model.estimate_scans(scans).covariances
+    np.testing.assert_allclose(covariances[:, 2, 2], expected[:, 2, 2])
+    assert np.isnan(covariances[:, :2, :2]).all()
+    distance, turn = np.hypot(MEAN, DEVIATION)
+    np.testing.assert_allclose(loaded.model.typical_step, [distance, np.nan, turn], rtol=1e-6)
+    np.testing.assert_allclose(loaded.mean_step, steps_of(MEAN, "end"), rtol=1e-6)
+
+
+def test_older_checkpoint_of_another_form_is_refused(tmp_path):
+    path = as_of_old(tmp_path / "old.ckpt", build("cnn_reg"))
+    saved = torch.load(path, weights_only=True)
+    saved["state_dict"]["decoder.weight"] = torch.zeros(3)
+    torch.save(saved, path)
+    with pytest.raises(InputError, match=r"old\.ckpt: not a checkpoint of this project, or of an older"):
+        load_module(path)
+
+
+def test_modules_of_the_paper_know_their_model():
+    assert [type(build(name)) for name in NAMES] == NAMED
+    assert module_for("another").func is OdometryModule
 
 
 def test_checkpoint_holds_plain_values_only(tmp_path):

@@ -6,38 +6,41 @@ import numpy as np
 import onnx
 import onnxruntime
 import pytest
+import torch
 from onnx import numpy_helper
 
-from odometry import NAMES, build, random_scans
+from odometry import NAMES, SENSOR, build, random_scans
 from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import Step, advance
 from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.training.checkpoint_stepper import CheckpointStepper
+from rcnn_odom.models.trained import TorchStepper, TrainedModel
 from rcnn_odom.training.onnx_graph import check, to_onnx, write, write_metadata
 
 
 def steps(stepper, scans):
-    pairs = [scans[frame : frame + 2] for frame in range(len(scans) - 1)]
-    return np.array([np.concatenate(stepper(pair)) for pair in pairs])
+    """Steps and covariances side by side, (N, 12)."""
+    told = [stepper(scans[frame : frame + 2]) for frame in range(len(scans) - 1)]
+    return np.array([np.concatenate([step.array(), step.covariance.ravel()]) for step in told])
 
 
 @pytest.fixture(scope="module")
 def exported(tmp_path_factory):
-    """Paths of one recurrent module in both precisions, and the module."""
-    folder, module = tmp_path_factory.mktemp("onnx"), build("rcnn_cls", projection=32)
+    """Paths of one recurrent model in both precisions, and the model."""
+    folder, model = tmp_path_factory.mktemp("onnx"), build("rcnn_cls", projection=32)
     for precision in ("fp32", "int8"):
-        write(to_onnx(module, precision), folder / f"{precision}.onnx")
-    return folder, module
+        write(to_onnx(model, precision), folder / f"{precision}.onnx")
+    return folder, model
 
 
 @pytest.mark.parametrize("precision", ["fp32", "int8"])
 @pytest.mark.parametrize(("variant", "projection"), [*((name, None) for name in NAMES), ("rcnn_reg", 16)])
 def test_streamed_steps_equal_the_checkpoints(variant, projection, precision):
-    module = build(variant, projection)
-    stepper = OnnxStepper(to_onnx(module, precision).SerializeToString())
-    check(stepper, module)
+    model = build(variant, projection)
+    stepper = OnnxStepper(to_onnx(model, precision).SerializeToString())
+    check(stepper, model)
     scans = random_scans(30)
-    expected = steps(CheckpointStepper(module), scans)
+    expected = steps(TorchStepper(model), scans)
     # Eight bits leave errors of a few hundredths of what the outputs vary by.
     tolerance = 1e-5 if precision == "fp32" else 0.25 * np.ptp(expected, axis=0)
     got = steps(stepper, scans)
@@ -47,25 +50,17 @@ def test_streamed_steps_equal_the_checkpoints(variant, projection, precision):
 
 
 def test_the_file_can_be_used_without_this_project(exported):
-    folder, module = exported
+    folder, model = exported
+    # What follows is a stranger's program, who has read the description and has NumPy and ONNX Runtime.
     session = onnxruntime.InferenceSession(folder / "fp32.onnx")
-    meta = session.get_modelmeta()
-    told = json.loads(meta.custom_metadata_map["rcnn_odom"])
-    sensor = told["sensor"]
-    for words in ("Depth vector: bin i of 181", "Readings of 40.0 m or more", "h and c (2, 1, 16)"):
-        assert words in meta.description
-        assert words in meta.custom_metadata_map["about"]
+    sensor = json.loads(session.get_modelmeta().custom_metadata_map["rcnn_odom"])["sensor"]
+    state = {i.name: np.zeros(i.shape, np.float32) for i in session.get_inputs() if i.name != "scans"}
     rng = np.random.default_rng(0)
-    angles, motions, h, c, before = (
-        np.deg2rad(rng.uniform(-89, 89, 400)),
-        [],
-        *np.zeros((2, 2, 1, 16), "f4"),
-        None,
-    )
-    state_of_ours, ours = CheckpointStepper(module), []
+    angles, before = np.deg2rad(rng.uniform(-89, 89, 400)), None
+    x = y = heading = 0.0
+    depths, poses = [], []
     for _ in range(6):
         ranges = rng.uniform(1, 45, 400)
-        # As the description says, not with this project's code.
         sums, counts = np.zeros(181), np.zeros(181)
         for angle, distance in zip(np.rad2deg(angles), ranges, strict=True):
             if distance < sensor["max_range"]:
@@ -73,23 +68,42 @@ def test_the_file_can_be_used_without_this_project(exported):
                 sums[nearest] += distance
                 counts[nearest] += 1
         depth = (sums / np.maximum(counts, 1)).astype(np.float32)
-        np.testing.assert_allclose(depth, encode(angles, ranges, Sensor(**sensor)), rtol=1e-6)
         if before is not None:
-            pair = np.stack([before, depth])
-            motion, deviation, h, c = session.run(None, {"scans": pair[None], "h": h, "c": c})
-            motions.append(np.concatenate([motion[0], deviation[0]]))
-            ours.append(np.concatenate(state_of_ours(pair)))
+            step, _, h, c = session.run(None, {"scans": np.stack([before, depth])[None], **state})
+            state, (step_x, step_y, step_heading) = {"h": h, "c": c}, step[0]
+            x += np.cos(heading) * step_x - np.sin(heading) * step_y
+            y += np.sin(heading) * step_x + np.cos(heading) * step_y
+            heading += step_heading
+            poses.append([x, y, heading])
         before = depth
-    np.testing.assert_allclose(motions, ours, atol=1e-5)
+        np.testing.assert_allclose(depth, encode(angles, ranges, Sensor(**sensor)), rtol=1e-6)
+        depths.append(depth)
+    expected = [np.zeros(3)]
+    for step in steps(TorchStepper(model), np.array(depths)):
+        expected.append(advance(expected[-1], step[:3]))
+    np.testing.assert_allclose(poses, expected[1:], atol=1e-5)
+
+
+def test_the_file_describes_itself(exported):
+    meta = onnxruntime.InferenceSession(exported[0] / "fp32.onnx").get_modelmeta()
+    assert meta.description == meta.custom_metadata_map["about"]
+    for words in (
+        "Depth vector: bin i of 181",
+        "Readings of 40.0 m or more",
+        "h (2, 1, 16) and c (2, 1, 16), the network's state",
+        "x += cos(heading) * step_x - sin(heading) * step_y",
+        "covariance (1, 3, 3)",
+    ):
+        assert words in meta.description
 
 
 def test_h_and_c_are_states_of_their_own(exported):
     session = onnxruntime.InferenceSession(exported[0] / "fp32.onnx")
-    scans = random_scans(2)[None]
-    _, _, h, c = session.run(
-        None, {"scans": scans, "h": np.zeros((2, 1, 16), "f4"), "c": np.ones((2, 1, 16), "f4")}
-    )
+    scans, zeros, ones = random_scans(2)[None], np.zeros((2, 1, 16), "f4"), np.ones((2, 1, 16), "f4")
+    steps_, _, h, c = session.run(None, {"scans": scans, "h": zeros, "c": ones})
     assert np.abs(h - c).max() > 0.1
+    for other in ({"h": ones, "c": ones}, {"h": zeros, "c": zeros}):
+        assert np.abs(session.run(["step"], {"scans": scans, **other})[0] - steps_).max() > 1e-4
 
 
 def test_metadata_says_what_an_odometer_needs(exported):
@@ -97,10 +111,12 @@ def test_metadata_says_what_an_odometer_needs(exported):
         stepper = OnnxStepper(exported[0] / f"{precision}.onnx")
         assert stepper.metadata["precision"] == precision
         assert stepper.metadata["variant"] == "rcnn_cls"
-        description = stepper.description
-        assert (description.sensor, description.apply) == (Sensor(1.0, 180.0, 40.0), "middle")
-        assert description.typical_motion == pytest.approx((np.hypot(0.5, 0.2), np.hypot(0.01, 0.03)))
-        assert description.least_filled == pytest.approx(0.1)
+        assert stepper.metadata["format"] == 2
+        description, model = stepper.description, exported[1]
+        assert description.sensor == SENSOR
+        assert description.typical_step == pytest.approx(model.typical_step.tolist())
+        assert description.typical_step[2] == pytest.approx(np.hypot(0.01, 0.03))
+        assert (description.least_filled, description.period) == pytest.approx((0.1, 0.1))
 
 
 def test_int8_holds_the_weights_of_all_products_in_a_byte(exported):
@@ -118,31 +134,87 @@ def test_int8_holds_the_weights_of_all_products_in_a_byte(exported):
     assert not large
 
 
-def test_a_network_without_fitted_uncertainty_is_exported_without_deviations():
+def test_a_network_without_fitted_uncertainty_is_exported_without_covariances():
     stepper = OnnxStepper(to_onnx(build(fitted=False), "fp32").SerializeToString())
-    motion, deviation = stepper(random_scans(2))
-    assert np.isfinite(motion).all()
-    assert np.isnan(deviation).all()
+    step = stepper(random_scans(2))
+    assert np.isfinite(step.array()).all()
+    assert np.isnan(step.covariance).all()
     assert np.isnan(stepper.description.least_filled)
 
 
+def test_an_unknown_deviation_across_the_step_leaves_that_of_the_heading():
+    """As of checkpoints that knew distance and heading alone; of their typical step y is not known either."""
+    model = build()
+    known = TorchStepper(model)(random_scans(2)).covariance[2, 2]
+    model.uncertainty.lateral.fill_(np.nan)
+    model.typical_step[1] = np.nan
+    graph = to_onnx(model, "fp32")
+    stepper = OnnxStepper(graph.SerializeToString())
+    check(stepper, model)
+    assert json.loads({p.key: p.value for p in graph.metadata_props}["rcnn_odom"])["typical_step"][1] is None
+    covariance = stepper(random_scans(2)).covariance
+    assert covariance[2, 2] == pytest.approx(known)
+    assert np.isnan(covariance[:2, :2]).all()
+
+
+class Toy(TrainedModel):
+    """A network of a plugin: steps that slip sideways, its own covariances, two states with other names."""
+
+    name, Options = "toy", dict
+
+    def __init__(self):
+        super().__init__({}, SENSOR)
+        self.linear = torch.nn.Linear(2 * SENSOR.bins, 3)
+
+    def initial_state(self):
+        same = torch.zeros(1, 3)
+        return {"sum": same, "last": same}
+
+    def forward(self, pairs, state=()):
+        total, last = state or self.initial_state().values()
+        steps = []
+        for pair in pairs.flatten(2).unbind(1):
+            now = 0.01 * self.linear(pair)
+            total, last = total + now, now - last
+            steps.append(now + 0.1 * total.tanh() + 0.1 * last)
+        steps = torch.stack(steps, 1)
+        return steps, torch.diag_embed(steps.square() + 0.01), (total, last)
+
+    def loss(self, batch):
+        return {"loss": self(batch["pairs"])[0].sub(batch["steps"]).abs().mean()}
+
+
+@pytest.mark.parametrize("precision", ["fp32", "int8"])
+def test_a_model_of_a_plugin_is_exported_as_any_other(precision):
+    torch.manual_seed(0)
+    model = Toy().eval()
+    graph = to_onnx(model, precision)
+    assert [value.name for value in graph.graph.input] == ["scans", "sum", "last"]
+    assert [value.name for value in graph.graph.output] == ["step", "covariance", "sum_out", "last_out"]
+    stepper = OnnxStepper(graph.SerializeToString())
+    check(stepper, model)
+    scans = random_scans(10)
+    tolerance = {"fp32": 1e-5, "int8": 0.02}[precision]
+    np.testing.assert_allclose(steps(stepper, scans), steps(TorchStepper(model), scans), atol=tolerance)
+
+
 def test_a_graph_that_does_something_else_is_noticed():
-    module = build()
-    model = to_onnx(module, "fp32")
-    for weight in model.graph.initializer:
+    model = build()
+    graph = to_onnx(model, "fp32")
+    for weight in graph.graph.initializer:
         if weight.name.endswith("head.distance.bias"):
             weight.CopyFrom(numpy_helper.from_array(numpy_helper.to_array(weight) + 0.5, weight.name))
     with pytest.raises(
         InputError, match=r"the fp32 graph differs from its checkpoint by .* it is not written"
     ):
-        check(OnnxStepper(model.SerializeToString()), module)
+        check(OnnxStepper(graph.SerializeToString()), model)
 
 
 class FromTheThirdStepOn:
     """A stepper that does as another one, and then something else."""
 
-    def __init__(self, module, motion, deviation):
-        self.right, self.wrong, self.count = CheckpointStepper(module), (motion, deviation), 0
+    def __init__(self, model, step, covariance):
+        self.right, self.wrong, self.count = TorchStepper(model), (step, covariance), 0
         self.metadata = {"precision": "fp32"}
 
     def reset(self):
@@ -150,16 +222,25 @@ class FromTheThirdStepOn:
 
     def __call__(self, pair):
         self.count += 1
-        motion, deviation = self.right(pair)
-        return (motion + self.wrong[0], deviation + self.wrong[1]) if self.count > 2 else (motion, deviation)
+        step = self.right(pair)
+        if self.count <= 2:
+            return step
+        return Step(*(step.array() + self.wrong[0]), step.covariance + self.wrong[1])
 
 
 @pytest.mark.parametrize("wrong", [(np.nan, 0.0), (0.0, np.nan), (0.0, -7.0), (0.1, 0.0)])
-def test_wrong_later_steps_and_deviations_are_noticed(wrong):
-    module = build()
-    check(FromTheThirdStepOn(module, 0.0, 0.0), module)
+def test_wrong_later_steps_and_covariances_are_noticed(wrong):
+    model = build()
+    check(FromTheThirdStepOn(model, 0.0, 0.0), model)
     with pytest.raises(InputError, match="differs from its checkpoint"):
-        check(FromTheThirdStepOn(module, *wrong), module)
+        check(FromTheThirdStepOn(model, *wrong), model)
+
+
+def test_a_model_that_estimates_nan_is_noticed():
+    model = build()
+    model.head.distance.bias.data.fill_(np.nan)
+    with pytest.raises(InputError, match="differs from its checkpoint"):
+        check(FromTheThirdStepOn(model, 0.0, 0.0), model)
 
 
 def change_metadata(exported, folder, **changes):
@@ -175,8 +256,9 @@ def change_metadata(exported, folder, **changes):
     [
         ({"sensor": "gone"}, "not one of rcnn-odom export"),
         ({"sensor": {"resolution_deg": 0.7}}, "not one of rcnn-odom export"),
-        ({"apply": "sometimes"}, "not one of rcnn-odom export .*apply is 'sometimes'"),
-        ({"typical_motion": [1]}, "not one of rcnn-odom export"),
+        ({"typical_step": [1, 2]}, "not one of rcnn-odom export"),
+        ({"format": "gone"}, "written by an older version; export the checkpoint again"),
+        ({"format": 1}, "written by an older version; export the checkpoint again"),
         ({"sensor": {"resolution_deg": 0.5, "field_of_view_deg": 180.0}}, "differ in the sensor"),
     ],
 )

@@ -15,8 +15,8 @@ import torch
 import yaml
 
 from conftest import ROOT
+from rcnn_odom.evaluation.run_folder import BEST, LAST
 from rcnn_odom.files import one_at_a_time
-from rcnn_odom.training.run_state import BEST, LAST
 from rcnn_odom.training.sweep import LONGEST_NAME, expected_folders, folder_name
 from train import train
 
@@ -63,6 +63,7 @@ def test_what_a_folder_may_not_be_called_still_tells_jobs_apart():
     assert all(re.fullmatch(r"[\w.~+-]+", name) for name in names)
 
 
+@pytest.mark.slow
 def test_a_killed_sweep_goes_on_where_it_was(command, sweep, tmp_path):
     options = ["+sweeps=kernel_size", "model.kernel_size=3,5", "seed=0", "model.epochs=3"]
     process = subprocess.Popen(command(*options), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL)
@@ -157,6 +158,7 @@ def test_a_sweep_without_multirun_is_refused(kitti, tmp_path):
     assert "+sweeps= needs -m" in done.stdout + done.stderr
 
 
+@pytest.mark.slow
 def test_a_moved_sweep_is_known_again(sweep, tmp_path):
     options = ["model=cnn_reg", "model.epochs=1", "seed=0"]
     sweep(*options, f"hydra.sweep.dir={tmp_path}/here")
@@ -165,6 +167,7 @@ def test_a_moved_sweep_is_known_again(sweep, tmp_path):
     assert "is finished already" in printed
 
 
+@pytest.mark.slow
 def test_sampling_sweepers_draw_once_for_all_processes(sweep, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="the extra 'sweeps' is not installed")
     small = ["model=cnn_reg", "model.epochs=1", "trainer=ddp", f"hydra.sweep.dir={tmp_path}/drawn"]
@@ -175,6 +178,7 @@ def test_sampling_sweepers_draw_once_for_all_processes(sweep, tmp_path):
     assert used == drawn
 
 
+@pytest.mark.slow
 def test_optuna_minimises_validation_drift_and_goes_on(sweep, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_optuna_sweeper", reason="the extra 'sweeps' is not installed")
     small = ["model.hidden_size=16", "model.epochs=1", "model.first_stage.epochs=1"]
@@ -190,6 +194,7 @@ def test_optuna_minimises_validation_drift_and_goes_on(sweep, tmp_path):
     assert sweep(*options).count("is finished already") == 2
 
 
+@pytest.mark.slow
 def test_jobs_of_joblib_train_their_first_stage_once(sweep, tmp_path):
     pytest.importorskip("hydra_plugins.hydra_joblib_launcher", reason="the extra 'sweeps' is not installed")
     small = ["model.epochs=1", "model.hidden_size=16", "model.first_stage.epochs=1", "seed=0"]

@@ -12,8 +12,8 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "export",
         help="write a trained network as an ONNX file",
-        description="Write the network of a run as one ONNX file: a pair of scans in, a motion and its "
-        "deviations out, the LSTM's state explicit, with the sensor and the encoding of scans in its "
+        description="Write the network of a run as one ONNX file: a pair of scans in, a step and its "
+        "covariance out, the network's state explicit, with the sensor and the encoding of scans in its "
         "metadata. The file is compared with the checkpoint step by step, and the drift of each precision on "
         "the run's test sequences is printed. int8 that costs more than 0.1 percentage points of drift is "
         "not written.",
@@ -36,7 +36,7 @@ def add(commands: Subcommands) -> None:
         nargs="+",
         metavar="NAME",
         help="drives to fit the uncertainty of steps on anew, in place of the run's validation drives; more "
-        "of them know more. They must be neither trained nor tested on",
+        "of them know more. They must be neither trained nor tested on. The checkpoint keeps its own",
     )
     parser.add_argument(
         "--no-drift",
@@ -47,8 +47,8 @@ def add(commands: Subcommands) -> None:
 
 
 def _run_export(arguments: argparse.Namespace) -> int:
+    from rcnn_odom.evaluation.run_folder import BEST
     from rcnn_odom.training.export import export_checkpoint, export_unscored
-    from rcnn_odom.training.run_state import BEST
 
     checkpoint = arguments.checkpoint
     if checkpoint.is_dir():

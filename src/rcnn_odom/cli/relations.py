@@ -25,7 +25,7 @@ def add(commands: Subcommands) -> None:
         "relations",
         help="score a trajectory against hand-verified relations between scans",
         description="Score a trajectory against hand-verified relative poses between scans of a CARMEN log "
-        "(Kuemmerle et al. 2009). Sequential relations, from one place to the next, and loops are told apart "
+        "(Kuemmerle et al. 2009). Sequential relations, from one place to the next, and loops are separated "
         "by the way between their scans, along the log's wheel odometry.",
     )
     add = parser.add_argument

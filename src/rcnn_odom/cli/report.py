@@ -12,9 +12,9 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "report",
         help="compare the runs of a sweep: tables, differences with intervals, figures",
-        description="Writes report.md, report.html and report_figures into a folder of runs: drift by "
-        "setting over seeds, which differences are shown and which are not, the paper's figures, errors of "
-        "a frame, curves, trajectories, times and commands. Runs that are not finished are named, and in "
+        description="Writes report.md, report.html and report_figures into a folder of runs: drift and "
+        "other metrics by setting over seeds, which differences are shown and which are not, the paper's "
+        "figures, curves, trajectories, times and commands. Runs that are not finished are named, and in "
         "no mean.",
     )
     parser.add_argument(
@@ -45,8 +45,10 @@ def add(commands: Subcommands) -> None:
 
 def _run_report(arguments: argparse.Namespace) -> int:
     from rcnn_odom.evaluation.sweep_report.build import make_report
+    from rcnn_odom.training.sweep import expected_folders
 
-    written = make_report(arguments.directory, arguments.only, arguments.reference)
+    expected = expected_folders(arguments.directory)
+    written = make_report(arguments.directory, arguments.only, arguments.reference, expected)
     if arguments.json:
         print(json.dumps(written.content, indent=1))
         return 0

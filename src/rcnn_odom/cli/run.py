@@ -2,6 +2,7 @@
 
 import argparse
 import io
+import json
 import logging
 import sys
 from pathlib import Path
@@ -10,7 +11,7 @@ from typing import TYPE_CHECKING
 from rcnn_odom.cli.arguments import Subcommands, whole_number
 
 if TYPE_CHECKING:
-    from rcnn_odom.deployment.odometer import Odometer
+    from rcnn_odom.deployment.odometer import Odometer, Pose
 
 
 def add(commands: Subcommands) -> None:
@@ -27,11 +28,12 @@ def add(commands: Subcommands) -> None:
     )
     add = parser.add_argument
     add(
-        "model",
-        metavar="MODEL",
-        help="an exported .onnx, a .ckpt, or rcnn_small, which ships along",
+        "paths",
+        nargs="*",
+        metavar="MODEL INPUT",
+        help="the model, unless --model names it, and the recording",
     )
-    add("input", nargs="?", type=Path, metavar="INPUT", help="the recording")
+    add("--model", metavar="MODEL", help="an exported .onnx, a .ckpt, or rcnn_small, which ships along")
     add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
     add("--out", type=Path, metavar="DIR", help="folder to write to; must not hold a trajectory yet")
     add("--topic", help="of the LaserScan messages in a bag that has several")
@@ -48,30 +50,26 @@ def add(commands: Subcommands) -> None:
 
 
 def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    if arguments.live == (arguments.input is not None):
-        parser.error("give either INPUT or --live")
+    paths = [arguments.model, *arguments.paths] if arguments.model else arguments.paths
+    if len(paths) != (1 if arguments.live else 2):
+        parser.error("give MODEL and either INPUT or --live")
     if not arguments.live and arguments.out is None:
         parser.error("--out DIR is needed")
 
-    from rcnn_odom.deployment.run import format_summary, print_pose, run
+    from rcnn_odom.deployment.run import format_summary, run
     from rcnn_odom.recordings import json_lines
     from rcnn_odom.recordings.formats import open_stream
 
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    odometer = _load(arguments.model, arguments.threads)
-    model = Path(arguments.model).stem
+    odometer, model = _load(paths[0], arguments.threads), Path(paths[0]).stem
     if arguments.live:
         if isinstance(sys.stdin, io.TextIOWrapper):
             sys.stdin.reconfigure(errors="replace")  # bytes that are no text are a line that is no scan
-        summary = run(odometer, json_lines.stream(sys.stdin), model, arguments.out, print_pose)
+        summary = run(odometer, json_lines.stream(sys.stdin), model, arguments.out, _print_pose)
         print(format_summary(summary), file=sys.stderr)
         return 0
-    stream = open_stream(
-        arguments.input,
-        topic=arguments.topic,
-        ring=arguments.ring,
-        field_of_view_deg=arguments.field_of_view_deg,
-    )
+    options = {name: getattr(arguments, name) for name in ("topic", "ring", "field_of_view_deg")}
+    stream = open_stream(Path(paths[1]), options)
     for note in stream.notes:
         print(f"{stream.name}: {note}")
     print(format_summary(run(odometer, stream, model, arguments.out)))
@@ -79,12 +77,15 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     return 0
 
 
+def _print_pose(pose: "Pose") -> None:
+    print(json.dumps(pose.as_dict()), flush=True)
+
+
 def _load(model: str, threads: int) -> "Odometer":
+    if model.endswith(".ckpt"):
+        from rcnn_odom.training.export import load_odometer
+
+        return load_odometer(Path(model), threads)
     from rcnn_odom.deployment.odometer import Odometer
 
-    if not model.endswith(".ckpt"):
-        return Odometer.from_onnx(model, threads=threads)
-    import torch
-
-    torch.set_num_threads(threads)
-    return Odometer.from_checkpoint(model)
+    return Odometer.from_onnx(model, threads=threads)

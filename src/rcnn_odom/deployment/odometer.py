@@ -2,16 +2,20 @@
 
 import math
 from collections import deque
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
+from rcnn_odom.deployment.onnx_model import OnnxStepper
+from rcnn_odom.deployment.shipped import find_file
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import ApplyStep, FloatArray, advance, planar_to_poses
-from rcnn_odom.models.encoding import Sensor, decode, encode
+from rcnn_odom.geometry import FloatArray, Step, advance, planar_to_poses
+from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.encoding import Sensor, decode
+from rcnn_odom.recordings.scan import Scan
 
 LONGEST_HOLD = 10
 """Periods over which the last motion goes on; for longer it is not known to."""
@@ -30,38 +34,12 @@ LATE_IN_A_ROW = 5
 """After so many late scans it is the clock that has been set."""
 
 
-@dataclass(frozen=True)
-class Description:
-    """What an odometer has to know of its network.
-
-    Attributes:
-        sensor: that the network was trained for.
-        apply: where along its turn a step is taken.
-        typical_motion: root mean square of the training motions, metres and radians.
-        least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
-        period: usual seconds between scans in training; nan if unknown.
-    """
-
-    sensor: Sensor
-    apply: ApplyStep
-    typical_motion: tuple[float, float]
-    least_filled: float
-    period: float
+def _no_step() -> Step:
+    """Where the pose does not change, and that is certain: at the origin, and where it is told again."""
+    return Step(0.0, 0.0, 0.0, np.zeros((3, 3)))
 
 
-class Stepper(Protocol):
-    """A network that estimates one motion after the other and carries its own state."""
-
-    description: Description
-
-    def __call__(self, pair: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
-        """Motion (2,) and its standard deviations (2,) from scans (2, bins) in metres, the earlier first."""
-
-    def reset(self) -> None:
-        """Forgets all earlier pairs."""
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Pose:
     """Where the laser is, seen from where its first scan was taken, and the step since the last pose.
 
@@ -69,10 +47,9 @@ class Pose:
         stamp: seconds, of the scan; None where it has none.
         x, y: metres, x ahead and y to the left of the first scan.
         heading: radians, counter-clockwise, not wrapped.
-        distance, turn: the step, metres and radians.
-        distance_deviation, turn_deviation: its standard deviations, which hold 68 % of the errors on
-            validation drives; nan where the network's uncertainty has not been fitted. Where the last
-            motion only went on, as large as typical motions.
+        step: from the pose before. Its covariance is fitted so that 68 % of the errors on validation drives
+            lie within one standard deviation; nan where the network does not know it. Where the last motion
+            only went on, the deviations are as large as typical motions.
         degraded: empty, or in words why the estimate is worse than its network's usual.
     """
 
@@ -80,10 +57,7 @@ class Pose:
     x: float = 0.0
     y: float = 0.0
     heading: float = 0.0
-    distance: float = 0.0
-    turn: float = 0.0
-    distance_deviation: float = 0.0
-    turn_deviation: float = 0.0
+    step: Step = field(default_factory=_no_step)
     degraded: str = ""
 
     def matrix(self) -> FloatArray:
@@ -92,10 +66,18 @@ class Pose:
 
     def as_dict(self) -> dict[str, Any]:
         """Plain values for JSON, None in place of nan."""
-        return {key: None if value != value else value for key, value in asdict(self).items()}
-
-
-NO_STEP = dict.fromkeys(("distance", "turn", "distance_deviation", "turn_deviation"), 0.0)
+        return {
+            "stamp": self.stamp,
+            "x": self.x,
+            "y": self.y,
+            "heading": self.heading,
+            "step": self.step.array().tolist(),
+            "covariance": [
+                [None if math.isnan(value) else value for value in row]
+                for row in self.step.covariance.tolist()
+            ],
+            "degraded": self.degraded,
+        }
 
 
 class Odometer:
@@ -125,20 +107,7 @@ class Odometer:
     def __init__(self, stepper: Stepper) -> None:
         self._stepper = stepper
         self.description = stepper.description
-        self._spaced: tuple[int, FloatArray] = (0, np.empty(0))
         self.reset()
-
-    @classmethod
-    def from_checkpoint(cls, path: str | Path) -> "Odometer":
-        """The network of a run's checkpoint, computed by PyTorch, on as many threads as it is set to.
-
-        Raises:
-            InputError: not a checkpoint of this project.
-        """
-        from rcnn_odom.training.checkpoint import load_module
-        from rcnn_odom.training.checkpoint_stepper import CheckpointStepper
-
-        return cls(CheckpointStepper(load_module(path)))
 
     @classmethod
     def from_onnx(cls, path: str | Path, sensor: Sensor | None = None, threads: int = 1) -> "Odometer":
@@ -152,21 +121,31 @@ class Odometer:
         Raises:
             InputError: no such file, not one of ``rcnn-odom export``, or of another sensor.
         """
-        from rcnn_odom.deployment.onnx_model import OnnxStepper
-        from rcnn_odom.deployment.shipped import find_model
-
-        odometer = cls(OnnxStepper(find_model(path), threads))
+        odometer = cls(OnnxStepper(find_file(path), threads))
         if sensor is not None and odometer.description.sensor != sensor:
             raise InputError(
                 f"{path}: made for {odometer.description.sensor}, not {sensor}; take a fitting one"
             )
         return odometer
 
+    @classmethod
+    def from_checkpoint(cls, path: str | Path) -> "Odometer":
+        """Tells where to go with a checkpoint, which is exported before it runs.
+
+        Raises:
+            InputError: always.
+        """
+        raise InputError(
+            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {path}, then "
+            f"Odometer.from_onnx; at once: rcnn_odom.training.export.load_odometer({str(path)!r})"
+        )
+
     def reset(self) -> None:
         """Begins anew: the next scan is the origin."""
         self._stepper.reset()
-        self._scan: npt.NDArray[np.float32] | None = None
-        self._pose, self._motion, self._told = np.zeros(3), np.zeros(2), Pose()
+        self._earlier: npt.NDArray[np.float32] | None = None  # the last scan with returns
+        self._present: npt.NDArray[np.float32] | None = None  # the scan that was taken at the last pose
+        self._position, self._motion, self._last_pose = np.zeros(3), np.zeros(3), Pose()
         self._missed, self._held, self._beams, self._spacing = 0, 0, 0, 0.0
         self._forget_clock()
 
@@ -176,100 +155,89 @@ class Odometer:
         self._intervals: deque[float] = deque(maxlen=REMEMBERED)
 
     def step(
-        self, scan: npt.ArrayLike, stamp: float | None = None, angles: npt.ArrayLike | None = None
+        self, scan: Scan | npt.ArrayLike, stamp: float | None = None, angles: npt.ArrayLike | None = None
     ) -> Pose:
         """The pose at one more scan.
 
         Args:
-            scan: ranges (P,) in metres, counter-clockwise, or points (P, 2 or more), x ahead and y to
-                the left in metres. What is not positive, not finite, or at the sensor's maximum range or
-                beyond it is no return.
-            stamp: seconds. Without one (None, nan) the scan counts as the next after the last one.
+            scan: a :class:`Scan`, which has its own stamp and bearings; or ranges (P,) in metres,
+                counter-clockwise; or points (P, 2 or more), x ahead and y to the left in metres. What is not
+                positive, not finite, or at the sensor's maximum range or beyond it is no return.
+            stamp: seconds, of ranges or points. Without one (None, nan) the scan counts as the next after
+                the last one.
             angles: of the ranges, (P,) radians, 0 ahead, counter-clockwise. None: evenly over the
                 sensor's field of view, from its right end or from behind on.
 
         Raises:
             ValueError: the arrays' shapes do not fit.
+
+        >>> pose = Odometer.from_onnx("rcnn_small").step(np.full(3601, 8.0))
+        >>> pose.x, pose.y, pose.heading, pose.degraded
+        (0.0, 0.0, 0.0, '')
         """
-        stamp = None if stamp is None or not math.isfinite(stamp) else float(stamp)
-        lost = 0
+        if not isinstance(scan, Scan):
+            scan = _as_scan(scan, stamp, angles)
+        stamp = None if scan.stamp is None or not math.isfinite(scan.stamp) else float(scan.stamp)
+        lost, self._present = 0, None
         if stamp is not None and self._stamp is not None and stamp <= self._stamp:
             self._late += 1
             if self._late < LATE_IN_A_ROW:
                 late = f"{LATE}: stamp {stamp:.6f} is not after {self._stamp:.6f}, passed over"
-                return replace(self._told, **NO_STEP, degraded=late)
+                return replace(self._last_pose, step=_no_step(), degraded=late)
             lost = self._late - 1
             self._forget_clock()
-        depth, notes = self._encode(scan, angles)
+        depth, notes = self._encode(scan)
         periods = lost + self._count_periods(stamp, notes)
-        if self._scan is None:
+        if self._earlier is None:
             return self._begin(depth, stamp, notes)
         if not depth.any():
             self._missed += periods
             return self._hold(stamp, periods, ["no returns: the last motion goes on"])
-        earlier, gap = self._scan, periods + self._missed
-        self._scan, self._missed = depth, 0
+        earlier, gap = self._earlier, periods + self._missed
+        self._earlier, self._missed = depth, 0
         if gap > 1:
             notes.append(f"gap: {gap} periods after the last scan, the last motion goes on")
             return self._hold(stamp, periods, notes)
-        motion, deviation = self._stepper(np.stack([earlier, depth]))
-        if not np.isfinite(motion).all():
+        step = self._stepper(np.stack([earlier, depth]))
+        if not np.isfinite(step.array()).all():
             self._stepper.reset()  # its state is nan as well
             return self._hold(stamp, periods, [*notes, "no estimate: the last motion goes on"])
-        self._motion, self._held = motion, 0
-        self._pose = advance(self._pose, motion, self.description.apply)
-        return self._tell(stamp, motion, deviation, notes)
+        self._motion, self._held = step.array(), 0
+        return self._move(stamp, step, notes)
 
     def returns(self) -> npt.NDArray[np.float32]:
-        """The last scan with returns as points (P, 2) in the frame of the first one: bins with a return."""
-        if self._scan is None:
+        """Points (P, 2) of the last scan in the frame of the first one: its bins with a return.
+
+        None where the last scan had no return or was passed over as late.
+        """
+        if self._present is None:
             return np.empty((0, 2), np.float32)
-        pose = planar_to_poses(self._pose[None])[0]
-        points = decode(self._scan, self.description.sensor)
+        pose = planar_to_poses(self._position[None])[0]
+        points = decode(self._present, self.description.sensor)
         return (points @ pose[:2, :2].T + pose[:2, 3]).astype(np.float32)
 
-    def _encode(
-        self, scan: npt.ArrayLike, angles: npt.ArrayLike | None
-    ) -> tuple[npt.NDArray[np.float32], list[str]]:
+    def _encode(self, scan: Scan) -> tuple[npt.NDArray[np.float32], list[str]]:
         """A depth vector (bins,), and what is unusual about it."""
-        sensor, notes = self.description.sensor, []
-        values = np.asarray(scan, dtype=np.float64)
-        if values.ndim == 2 and values.shape[1] >= 2:
-            x, y = values[:, 0], values[:, 1]
-            depth = encode(np.arctan2(y, x), np.hypot(x, y), sensor)
-        elif values.ndim == 1 and (angles is None or np.shape(angles) == values.shape):
-            given = self._spread(len(values)) if angles is None else np.asarray(angles, dtype=np.float64)
-            depth = encode(given, values, sensor)
-            notes += self._compare_beams(given, exactly=angles is None)
-        else:
-            shapes = f"{values.shape} with angles of {None if angles is None else np.shape(angles)}"
-            raise ValueError(f"a scan is ranges (P,) with as many angles, or points (P, 2), not {shapes}")
+        depth = self._present = self.description.sensor.encode(scan)
+        notes = self._compare_beams(scan)
         filled = np.count_nonzero(depth) / len(depth)
         if filled < self.description.least_filled:
             notes.append(f"few returns: {filled:.1%} of the bins have one")
         return depth, notes
 
-    def _compare_beams(self, angles: FloatArray, exactly: bool) -> list[str]:
+    def _compare_beams(self, scan: Scan) -> list[str]:
         """Words about another number of beams than before, if there is one.
 
-        Given angles may be those of the returns alone, whose number changes: then only another spacing
-        counts, that of most neighbours.
+        Where bearings are given, only another spacing counts, that of most neighbours: they may be those of
+        the returns alone, whose number changes.
         """
-        before, count = self._beams, len(angles)
-        if count == before or count < 2:
+        before, last, count = self._beams, self._spacing, len(scan.ranges)
+        if not scan.has_all_beams or count == before or count < 2:
             return []
-        spacing, self._beams = float(np.median(np.abs(np.diff(angles)))), count
-        last, self._spacing = self._spacing, spacing
-        same = not before or (not exactly and abs(spacing - last) < SAME_SPACING * last)
+        spacing = math.nan if scan.bearings is None else float(np.median(np.diff(np.sort(scan.bearings))))
+        self._beams, self._spacing = count, spacing
+        same = not before or abs(spacing - last) < SAME_SPACING * last
         return [] if same else [f"beam count: {count} after {before}"]
-
-    def _spread(self, beams: int) -> FloatArray:
-        """Angles (beams,) in radians over the sensor's field of view."""
-        if self._spaced[0] != beams:
-            half = math.radians(self.description.sensor.field_of_view_deg) / 2
-            closes_circle = self.description.sensor.field_of_view_deg == 360
-            self._spaced = beams, np.linspace(-half, half, beams, endpoint=not closes_circle)
-        return self._spaced[1]
 
     def _count_periods(self, stamp: float | None, notes: list[str]) -> int:
         """How many usual periods after the last stamp this one comes, 1 or more; without stamps 1.
@@ -305,24 +273,35 @@ class Odometer:
     def _begin(self, depth: npt.NDArray[np.float32], stamp: float | None, notes: list[str]) -> Pose:
         """The pose of the first scan that has returns, and of those before it: the origin."""
         if depth.any():
-            self._scan = depth
+            self._earlier = depth
         else:
             notes = ["no returns: none since the start"]
-        return self._tell(stamp, np.zeros(2), np.zeros(2), notes)
+        return self._move(stamp, _no_step(), notes)
 
     def _hold(self, stamp: float | None, periods: int, notes: list[str]) -> Pose:
         """A pose where the last motion goes on, over ``LONGEST_HOLD`` periods in all at most."""
         moving = min(periods, LONGEST_HOLD - self._held)
         self._held += moving
+        held = np.zeros(3)
         for _ in range(moving):
-            self._pose = advance(self._pose, self._motion, self.description.apply)
-        typical = periods * np.array(self.description.typical_motion)
-        return self._tell(stamp, moving * self._motion, typical, notes)
+            held = advance(held, self._motion)
+        typical = periods * np.array(self.description.typical_step)
+        # What is unknown of one is unknown of its covariances with the others.
+        covariance = np.diag(np.square(typical)) + 0 * np.outer(typical, typical)
+        x, y, heading = held.tolist()
+        return self._move(stamp, Step(x, y, heading, covariance), notes)
 
-    def _tell(self, stamp: float | None, motion: FloatArray, deviation: FloatArray, notes: list[str]) -> Pose:
-        (x, y, heading), (distance, turn) = self._pose.tolist(), motion.tolist()
-        deviations = [float(value) for value in deviation]
-        self._told = Pose(
-            stamp, x, y, heading, distance, turn, deviations[0], deviations[1], degraded="; ".join(notes)
-        )
-        return self._told
+    def _move(self, stamp: float | None, step: Step, notes: list[str]) -> Pose:
+        """The pose after a step."""
+        self._position = advance(self._position, step.array())
+        x, y, heading = self._position.tolist()
+        self._last_pose = Pose(stamp, x, y, heading, step, "; ".join(notes))
+        return self._last_pose
+
+
+def _as_scan(values: npt.ArrayLike, stamp: float | None, angles: npt.ArrayLike | None) -> Scan:
+    values = np.asarray(values, dtype=np.float64)
+    if values.ndim == 2:
+        return Scan.from_points(values, stamp)
+    bearings = None if angles is None else np.asarray(angles, dtype=np.float64)
+    return Scan(values, bearings, stamp=stamp)

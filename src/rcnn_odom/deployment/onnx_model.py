@@ -7,17 +7,19 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.deployment.odometer import Description
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import STEP_FRACTION, FloatArray
+from rcnn_odom.geometry import Step
+from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
 
 METADATA = "rcnn_odom"
 """Key of the file's metadata that holds all that an odometer has to know, as JSON."""
+FORMAT = 2
+"""Of the files: 1 had the paper's two numbers as output and no ``format`` in its metadata."""
 
 
 class OnnxStepper:
-    """A file of ``rcnn-odom export`` as a :class:`rcnn_odom.deployment.odometer.Stepper`.
+    """A file of ``rcnn-odom export`` as a :class:`rcnn_odom.models.contract.Stepper`.
 
     Args:
         file: its path, or what it holds.
@@ -27,36 +29,42 @@ class OnnxStepper:
         metadata: what the file tells of itself; see :func:`rcnn_odom.training.onnx_graph.write`.
 
     Raises:
-        InputError: no such file, or not one of ``rcnn-odom export``.
+        InputError: no such file, or not one of ``rcnn-odom export`` of this version.
     """
 
     def __init__(self, file: str | Path | bytes, threads: int = 1) -> None:
         self._session = open_session(file, threads)
         path = "the graph" if isinstance(file, bytes) else file
+        inputs = {value.name: value.shape for value in self._session.get_inputs()}
         try:
-            self.metadata = json.loads(self._session.get_modelmeta().custom_metadata_map[METADATA])
-            self.description = _describe(self.metadata)
+            self.metadata = dict(json.loads(self._session.get_modelmeta().custom_metadata_map[METADATA]))
+            current = self.metadata.get("format") == FORMAT
+            if current:
+                self.description, bins = _describe(self.metadata), inputs.pop("scans")[-1]
         except (KeyError, TypeError, ValueError, InputError) as error:
             raise InputError(
                 f"{path}: an ONNX file, but not one of rcnn-odom export ({type(error).__name__}: {error}); "
                 "export the checkpoint again"
             ) from error
-        inputs = {value.name: value.shape for value in self._session.get_inputs()}
-        if inputs["scans"][-1] != self.description.sensor.bins:
+        if not current:
+            raise InputError(f"{path}: written by an older version; export the checkpoint again")
+        if bins != self.description.sensor.bins:
             raise InputError(f"{path}: its network and its metadata differ in the sensor; export it again")
-        self._empty = {name: np.zeros(shape, np.float32) for name, shape in inputs.items() if name != "scans"}
+        self._outputs = ["step", "covariance", *(f"{name}_out" for name in inputs)]
+        self._initial = {name: np.zeros(shape, np.float32) for name, shape in inputs.items()}
         self.reset()
 
     def reset(self) -> None:
         """Forgets all earlier pairs."""
         # An array of its own for h and for c: one for both would make them one state.
-        self._state = {name: zeros.copy() for name, zeros in self._empty.items()}
+        self._state = {name: zeros.copy() for name, zeros in self._initial.items()}
 
-    def __call__(self, pair: npt.NDArray[np.float32]) -> tuple[FloatArray, FloatArray]:
-        """Motion (2,) and its standard deviations (2,) from scans (2, bins) in metres, the earlier first."""
-        motion, deviation, *state = self._session.run(None, {"scans": pair[None], **self._state})
+    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
+        """The step between two encoded scans (2, bins), the earlier first."""
+        step, covariance, *state = self._session.run(self._outputs, {"scans": pair[None], **self._state})
         self._state = dict(zip(self._state, state, strict=True))
-        return motion[0].astype(np.float64), deviation[0].astype(np.float64)
+        x, y, heading = step[0].tolist()
+        return Step(x, y, heading, covariance[0].astype(np.float64))
 
 
 def open_session(file: str | Path | bytes, threads: int = 1) -> Any:
@@ -85,11 +93,7 @@ def open_session(file: str | Path | bytes, threads: int = 1) -> Any:
 
 
 def _describe(metadata: dict[str, Any]) -> Description:
-    distance, turn = map(float, metadata["typical_motion"])
-    apply, sensor = metadata["apply"], Sensor(**metadata["sensor"])
-    if apply not in STEP_FRACTION:
-        raise ValueError(f"apply is {apply!r}")
-    known = (metadata[key] for key in ("least_filled", "period"))
-    return Description(
-        sensor, apply, (distance, turn), *(float("nan") if v is None else float(v) for v in known)
-    )
+    """What the metadata say of the network; null is nan."""
+    values = [*metadata["typical_step"], metadata["least_filled"], metadata["period"]]
+    x, y, heading, filled, period = (np.nan if value is None else float(value) for value in values)
+    return Description(Sensor(**metadata["sensor"]), (x, y, heading), filled, period)

@@ -1,36 +1,30 @@
 """A trained network over a recording or a live laser: ``rcnn-odom run``."""
 
 import json
-import logging
-import sys
+import math
 import time
 from collections import Counter
 from collections.abc import Callable
 from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, TextIO, cast
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
 from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
-from rcnn_odom.deployment.sampling import Thinned
+from rcnn_odom.deployment.sampling import EvenSample
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import change_frame
-from rcnn_odom.recordings.formats import Scan, ScanStream, need_fitting_scan
+from rcnn_odom.recordings.formats import need_fitting_scan
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
-log = logging.getLogger(__name__)
-
-TRAJECTORY, TUM, STEPS, MAP, SUMMARY = (
-    "trajectory.txt",
-    "trajectory.tum",
-    "steps.jsonl",
-    "map.png",
-    "summary.json",
-)
+TRAJECTORY, TUM, STEPS = "trajectory.txt", "trajectory.tum", "steps.jsonl"
+MAP, SUMMARY = "map.png", "summary.json"
 MAP_SCANS = 2000
 """Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
 LATENCIES = 100_000
@@ -43,7 +37,7 @@ def run(
     stream: ScanStream,
     model: str,
     out: Path | None = None,
-    tell: Callable[[Pose], object] | None = None,
+    on_pose: Callable[[Pose], object] | None = None,
 ) -> Summary:
     """Poses for all scans of a stream.
 
@@ -55,7 +49,7 @@ def run(
         stream: the scans.
         model: what to call the network.
         out: folder for trajectories, steps, map and summary; it must not hold a trajectory yet.
-        tell: gets every pose as soon as it is known.
+        on_pose: gets every pose as soon as it is known.
 
     Returns:
         What ``summary.json`` holds: counts, path, and the time of a scan.
@@ -64,29 +58,29 @@ def run(
         InputError: the folder holds a trajectory or cannot be written, the laser is another than the
             model's, the stream has no scan or breaks off.
     """
-    record = Record(stream, model)
+    statistics = Statistics(stream, model)
     with ExitStack() as stack:
-        folder = stack.enter_context(closing(RunFolder(out, stream))) if out else None
+        folder = stack.enter_context(closing(OutputFolder(out, stream))) if out else None
         bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
         try:
             for scan in stack.enter_context(closing(bar)):
-                pose = record.step(odometer, scan)
+                pose = statistics.step(odometer, scan)
                 if folder:
                     folder.add(pose)
-                if tell:
-                    tell(pose)
-            if not record.scans:
+                if on_pose:
+                    on_pose(pose)
+            if not statistics.scans:
                 raise InputError(f"{stream.name}: no scan in it")
         except BaseException as error:
-            record.stopped = str(error) or type(error).__name__
+            statistics.stopped = str(error) or type(error).__name__
             raise
         finally:
             if folder:
-                folder.finish(record)
-    return record.summary()
+                folder.finish(statistics)
+    return statistics.summary()
 
 
-class Record:
+class Statistics:
     """What is counted and sampled along a run, in constant memory.
 
     Args:
@@ -99,8 +93,8 @@ class Record:
         self.scans, self.path, self.longest, self.stopped = 0, 0.0, 0.0, ""
         self._fits = False
         self.degraded: Counter[str] = Counter()
-        self.milliseconds = Thinned[float](LATENCIES)
-        self.seen = Thinned[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
+        self.milliseconds = EvenSample[float](LATENCIES)
+        self.sample = EvenSample[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
 
     def step(self, odometer: Odometer, scan: Scan) -> Pose:
         """One scan through the odometer, timed and counted.
@@ -112,14 +106,14 @@ class Record:
             need_fitting_scan(self.stream, scan, odometer.description.sensor)
             self._fits = True
         start = time.perf_counter()
-        pose = odometer.step(scan.ranges, scan.stamp if self.stream.has_clock else None, scan.angles)
+        pose = odometer.step(scan if self.stream.has_clock else replace(scan, stamp=None))
         milliseconds = 1e3 * (time.perf_counter() - start)
         self.scans += 1
-        self.path += abs(pose.distance)
+        self.path += math.hypot(pose.step.x, pose.step.y)
         self.longest = max(self.longest, milliseconds)
         self.milliseconds.add(lambda: milliseconds)
         self.degraded.update(note.split(":")[0] for note in pose.degraded.split("; ") if note)
-        self.seen.add(lambda: (pose, odometer.returns()))
+        self.sample.add(lambda: (pose, odometer.returns()))
         # A scan that was passed over keeps the stamp of the pose that it repeats.
         return pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
 
@@ -138,7 +132,7 @@ class Record:
         }
 
 
-class RunFolder:
+class OutputFolder:
     """The files of a run, begun with the first pose, each line written as soon as it is known.
 
     Args:
@@ -158,15 +152,15 @@ class RunFolder:
     def _begin(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            self._kitti, self._tum, self._steps = (self._open(name) for name in (TRAJECTORY, TUM, STEPS))
+            # Line by line, so that a run that is killed leaves no half of one.
+            self._kitti, self._tum, self._steps = (
+                self._files.enter_context((self.folder / name).open("w", buffering=1))
+                for name in (TRAJECTORY, TUM, STEPS)
+            )
         except OSError as error:
             raise InputError(
                 f"{self.folder}: cannot be written ({error.strerror}); choose another --out"
             ) from error
-
-    def _open(self, name: str) -> TextIO:
-        # Line by line, so that a run that is killed leaves no half of one.
-        return cast(TextIO, self._files.enter_context((self.folder / name).open("w", buffering=1)))
 
     def add(self, pose: Pose) -> None:
         """One more pose; without a stamp it is written under its number, a late one under no time.
@@ -183,16 +177,16 @@ class RunFolder:
         self._steps.write(json.dumps(pose.as_dict()) + "\n")
         self._written += 1
 
-    def finish(self, record: Record) -> None:
+    def finish(self, statistics: Statistics) -> None:
         """The map and the summary, where there is a pose."""
         if not self._written:
             return
         from rcnn_odom.evaluation.figures import map_figure
 
-        (self.folder / SUMMARY).write_text(json.dumps(record.summary(), indent=2) + "\n")
-        poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in record.seen.items])
-        points = [points for _, points in record.seen.items]
-        title = f"{self.stream.name} by {record.model}: {record.scans} scans, {record.path:.0f} m"
+        (self.folder / SUMMARY).write_text(json.dumps(statistics.summary(), indent=2) + "\n")
+        poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in statistics.sample.items])
+        points = [points for _, points in statistics.sample.items]
+        title = f"{self.stream.name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"
         map_figure(title, poses, points).savefig(self.folder / MAP, dpi=150)
 
     def close(self) -> None:
@@ -213,9 +207,3 @@ def format_summary(summary: Summary) -> str:
         f"{times['max_ms']:.2f}"
     )
     return "\n".join(lines)
-
-
-def print_pose(pose: Pose) -> None:
-    """A pose as a line of JSON on standard output, at once."""
-    sys.stdout.write(json.dumps(pose.as_dict()) + "\n")
-    sys.stdout.flush()

@@ -6,7 +6,7 @@ from typing import Generic, TypeVar
 Item = TypeVar("Item")
 
 
-class Thinned(Generic[Item]):
+class EvenSample(Generic[Item]):
     """Every item of a stream, then every second, every fourth ...: evenly spaced, never more than fit.
 
     Args:

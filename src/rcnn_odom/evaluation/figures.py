@@ -5,9 +5,10 @@ from typing import TYPE_CHECKING
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.geometry import FloatArray, poses_to_planar
+from rcnn_odom.geometry import FloatArray
 
 if TYPE_CHECKING:
+    from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
 TRUTH, ESTIMATE = "tab:blue", "tab:red"
@@ -19,23 +20,26 @@ def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "F
 
     Args:
         title: above the axes.
-        truth, estimate: laser poses (N, 4, 4) in metres; the estimate is laid at the first true pose.
+        truth, estimate: laser poses (N, 4, 4) in metres, each laid at its own first pose.
     """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7, 6), layout="constrained")
-    axes = figure.subplots()
-    origin = np.linalg.inv(truth[0])
-    for poses, colour, label in ((origin @ truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
-        x, y, _ = poses_to_planar(poses).T
-        # Driving up the page, left turns to the left.
-        axes.plot(-y, x, color=colour, label=label, linewidth=1.5)
+    # Driving up the page, left turns to the left.
+    seen = ((np.linalg.inv(poses[0]) @ poses)[:, :2, 3] @ ((0, 1), (-1, 0)) for poses in (truth, estimate))
+    draw_trajectory(figure.subplots(), title, *seen)
+    return figure
+
+
+def draw_trajectory(axes: "Axes", title: str, truth: FloatArray, estimate: FloatArray) -> None:
+    """Estimate over truth, (N, 2) metres to the right and ahead of the start."""
+    for way, colour, label in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
+        axes.plot(*way.T, color=colour, label=label, linewidth=1.5)
     axes.plot(0, 0, "k^", label="start")
     axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
-    axes.legend()
-    return figure
+    axes.legend(fontsize="small")
 
 
 def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figure":

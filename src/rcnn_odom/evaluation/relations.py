@@ -80,7 +80,7 @@ def score_relations(
     Args:
         relations: verified by people.
         stamps: (N,) of all scans of the log, see :func:`stamp_keys`.
-        driven: (N,) metres along the log's way, by which loops are told from sequential relations.
+        driven: (N,) metres along the log's way, by which loops are known from sequential relations.
         poses: estimated laser poses (N, 4, 4), nan where there is none.
         loop_path: metres driven from which on a relation closes a loop.
 

@@ -1,119 +1,134 @@
-"""Scores of estimated motions: drift, its floor, and the errors of single frames; files of motions."""
+"""Scores of estimated steps: drift, its floor, every metric; errors of a stretch; tables for terminals."""
 
 from collections.abc import Mapping, Sequence
-from typing import Any
 
 import numpy as np
 
-from rcnn_odom.evaluation.drift import Drift, drift
-from rcnn_odom.geometry import ApplyStep, FloatArray, change_frame, compose, motion_errors
-from rcnn_odom.recordings.cache import EncodedSequence
+from rcnn_odom.evaluation.metrics import (
+    Report,
+    all_metrics,
+    combine,
+    frame_errors,
+    planar_drift,
+    score_metrics,
+)
+from rcnn_odom.geometry import FloatArray, Steps, compose, motion_errors, motions_of
+from rcnn_odom.models.two_numbers import Apply, restate, steps_of
+from rcnn_odom.recordings.recording import Drive
 
-STANDING = (0.01, np.deg2rad(0.2))
-"""A frame stands still when it moves less than this, metres and radians: the noise of good odometry."""
 SMOOTHING = 11
 """Frames under the filter that takes the jitter out of a true distance: a second of KITTI."""
 
-Report = dict[str, Any]
-"""Plain numbers under names, ready for JSON."""
 
-
-def camera_trajectory(sequence: EncodedSequence, motions: FloatArray, apply: ApplyStep) -> FloatArray:
-    """Estimated poses (N, 4, 4) of motions (N-1, 2) in the frame of the sequence's trajectory files."""
-    return change_frame(compose(motions, apply), sequence.camera_from_laser)
-
-
-def planar_drift(sequence: EncodedSequence, poses: FloatArray, lengths: list[float]) -> Drift:
-    """Drift of laser poses (N, 4, 4) over one sequence, as ``rcnn-odom drift --planar`` prints it."""
-    estimate = change_frame(poses, sequence.camera_from_laser)
-    return drift(sequence.camera_poses, estimate, planar=True, lengths=lengths)
-
-
-def score(
-    sequence: EncodedSequence,
-    motions: FloatArray,
-    lengths: list[float],
-    apply: ApplyStep = "end",
-    poses: FloatArray | None = None,
-) -> Report:
-    """Everything that is reported of one sequence.
+def score(drive: Drive, steps: Steps, lengths: Sequence[float], apply: Apply = "end") -> Report:
+    """Everything that is reported of one drive.
 
     Args:
-        sequence: with its truth.
-        motions: estimated, (N-1, 2) metres and radians.
+        drive: with its truth.
+        steps: estimated.
         lengths: of the drift's segments in metres.
-        apply: where along its turn a step is taken, for the estimate and the floor.
-        poses: estimated laser poses (N, 4, 4), the first the identity, of a method that also knows the
-            step's sideways part; their drift is scored in place of the composed motions'.
+        apply: where along its turn a distance is driven, for the floor.
 
     Returns:
-        ``drift`` of the estimate and ``floor`` of the true motions composed the same way, both as the
-        command line prints them, and the errors of single frames.
+        ``drift`` of the estimate and ``floor``, the drift of the true steps cut to two numbers, both as the
+        command line prints them; the errors of single frames; and every other metric.
     """
-    poses = compose(motions, apply) if poses is None else poses
+    floor = Steps.certain_of_nothing(restate(drive.steps, apply))
     return {
-        "frames": len(sequence),
-        "drift": planar_drift(sequence, poses, lengths).to_dict(),
-        "floor": planar_drift(sequence, compose(sequence.motions, apply), lengths).to_dict(),
-        **frame_errors(motions, sequence.motions),
+        **score_metrics(drive, steps, lengths),
+        "frames": len(drive),
+        "drift": planar_drift(drive, steps, lengths).to_dict(),
+        "floor": planar_drift(drive, floor, lengths).to_dict(),
+        **frame_errors(motions_of(steps.values), drive.motions),
     }
 
 
-def frame_errors(motions: FloatArray, truth: FloatArray) -> Report:
-    """Errors of motions (N, 2) against the truth (N, 2): mean absolute, mean signed, largest.
+def score_all(
+    drives: Sequence[Drive], steps: Mapping[str, Steps], lengths: Sequence[float], apply: Apply = "end"
+) -> Report:
+    """Scores of all drives.
 
-    Frames that move and frames that stand still, by the truth, are also told apart.
+    Args:
+        drives: with their truth.
+        steps: estimated, by the name of the drive.
+        lengths, apply: as in :func:`score`.
+
+    Returns:
+        ``drift`` and ``floor`` (means over the drives that have a segment, ratios; None without any),
+        ``lengths``, ``metrics`` (each over all drives, by name), and the drives' own scores under
+        ``sequences``, see :func:`score`.
     """
-    error = motion_errors(motions, truth)
-    standing = (np.abs(truth) < STANDING).all(1)
-    report = _errors(error)
-    for name, chosen in (("moving", ~standing), ("standing", standing)):
-        report[name] = {"frames": int(chosen.sum()), **(_errors(error[chosen]) if chosen.any() else {})}
-    return report
+    scores = {drive.name: score(drive, steps[drive.name], lengths, apply) for drive in drives}
+    floors = [one["floor"]["t_err"] for one in scores.values() if one["floor"]["segments"]]
+    metrics = combine(scores.values(), all_metrics().values())
+    return {
+        "drift": metrics["drift"],
+        "floor": float(np.mean(floors)) if floors else None,
+        "lengths": list(lengths),
+        "metrics": metrics,
+        "sequences": scores,
+    }
 
 
-def coverage(motions: FloatArray, truth: FloatArray, deviations: FloatArray) -> Report:
+def in_deviations(steps: Steps, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Errors of distance and heading in units of their estimated standard deviations.
+
+    The deviation of the distance is that along the estimated heading in mid-turn, where the distance is too.
+
+    Args:
+        steps: estimated.
+        truth: true steps (N-1, 3).
+
+    Returns:
+        Absolute errors over deviations, and the deviations (metres, radians), of the K steps whose
+        deviations are known, each (K, 2).
+    """
+    half = steps.values[:, 2] / 2
+    along = np.stack([np.cos(half), np.sin(half)], axis=1)
+    distance = np.einsum("ni,nij,nj->n", along, steps.covariances[:, :2, :2], along)
+    deviations = np.sqrt(np.stack([distance, steps.covariances[:, 2, 2]], axis=1))
+    errors = np.abs(motion_errors(motions_of(steps.values), motions_of(truth)))
+    known = np.isfinite(deviations).all(1)
+    return errors[known] / deviations[known], deviations[known]
+
+
+def coverage(steps: Steps, truth: FloatArray) -> Report | None:
     """How often the truth lies within one and two of the estimated standard deviations.
 
     Args:
-        motions, truth, deviations: (N, 2) metres and radians.
+        steps: estimated.
+        truth: true steps (N-1, 3).
 
     Returns:
         Shares under ``distance`` and ``heading``, there under ``1`` and ``2``: 0.683 and 0.954 for normal
-        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``.
+        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``. None where no
+        step's deviations are known.
     """
-    ratios = np.abs(motion_errors(motions, truth)) / deviations
-    report: Report = {
-        name: {str(times): float((ratios[:, output] <= times).mean()) for times in (1, 2)}
-        for output, name in enumerate(("distance", "heading"))
+    ratios, deviations = in_deviations(steps, truth)
+    if not len(ratios):
+        return None
+    distance, heading = deviations.mean(0)
+    return {
+        **{
+            name: {str(times): float((ratios[:, column] <= times).mean()) for times in (1, 2)}
+            for column, name in enumerate(("distance", "heading"))
+        },
+        "distance_m": float(distance),
+        "heading_deg": float(np.rad2deg(heading)),
     }
-    report["distance_m"], report["heading_deg"] = (
-        float(deviations[:, 0].mean()),
-        float(np.rad2deg(deviations[:, 1]).mean()),
-    )
-    return report
 
 
-def _errors(error: FloatArray) -> Report:
-    report = {}
-    for name, values in (("distance_{}_m", error[:, 0]), ("heading_{}_deg", np.rad2deg(error[:, 1]))):
-        report[name.format("mae")] = float(np.abs(values).mean())
-        report[name.format("bias")] = float(values.mean())
-        report[name.format("max")] = float(np.abs(values).max())
-    return report
-
-
-def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply: ApplyStep = "end") -> Report:
+def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply: Apply = "end") -> Report:
     """Errors of a stretch of a drive: of its single frames, and of the place where it ends.
 
     Args:
         motions: estimated, of the whole drive, (N, 2) metres and radians.
         truth: of the whole drive, (N, 2).
         chosen: rows of the stretch, at least one.
-        apply: where along its turn a step is taken, for both.
+        apply: where along its turn a distance is driven, for both.
 
     Returns:
-        What :func:`frame_errors` tells, ``smoothed_distance_*`` against the smoothed true distance,
+        What :func:`frame_errors` gives, ``smoothed_distance_*`` against the smoothed true distance,
         ``path_m``, and of the motions composed from the stretch's start ``end_m`` and ``end_ratio``, the
         part of the path (None where the truth stands still).
     """
@@ -122,7 +137,9 @@ def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply:
     against_smoothed = frame_errors(motions[chosen], smoothed[chosen])
     for name in ("distance_mae_m", "distance_bias_m", "distance_max_m"):
         report[f"smoothed_{name}"] = against_smoothed[name]
-    estimate_end, true_end = (compose(every[chosen], apply)[-1, :3, 3] for every in (motions, truth))
+    estimate_end, true_end = (
+        compose(steps_of(every[chosen], apply))[-1, :3, 3] for every in (motions, truth)
+    )
     end, path = float(np.linalg.norm(estimate_end - true_end)), float(np.abs(truth[chosen, 0]).sum())
     return {**report, "path_m": path, "end_m": end, "end_ratio": end / path if path else None}
 
@@ -137,27 +154,6 @@ def smooth(distances: FloatArray) -> FloatArray:
     window = min(SMOOTHING, len(distances) - (len(distances) + 1) % 2)
     smoothed: FloatArray = savgol_filter(distances, window, polyorder=min(2, window - 1))
     return smoothed
-
-
-def score_all(
-    sequences: list[EncodedSequence],
-    motions: Mapping[str, FloatArray],
-    lengths: list[float],
-    apply: ApplyStep = "end",
-    poses: Mapping[str, FloatArray] | None = None,
-) -> Report:
-    """Scores of all sequences by name, and the means over those that have a segment; see :func:`score`.
-
-    Returns:
-        ``drift`` and ``floor`` (ratios; None without any segment) and ``sequences``.
-    """
-    poses = poses or {}
-    scores = {s.name: score(s, motions[s.name], lengths, apply, poses.get(s.name)) for s in sequences}
-    report: Report = {}
-    for key in ("drift", "floor"):
-        drifts = [one[key]["t_err"] for one in scores.values() if one[key]["segments"]]
-        report[key] = float(np.mean(drifts)) if drifts else None
-    return {**report, "lengths": list(lengths), "sequences": scores}
 
 
 def table(reports: Mapping[str, Report]) -> str:
@@ -177,6 +173,20 @@ def table(reports: Mapping[str, Report]) -> str:
     segments = [first["sequences"][name]["drift"]["segments"] for name in names]
     rows.append(["segments", *map(str, segments), ""])
     return aligned(rows)
+
+
+def metrics_table(reports: Mapping[str, Report]) -> str:
+    """Text with a row for each method and a column for each metric over all sequences, without the drift.
+
+    Args:
+        reports: of :func:`score_all` by the name of the method.
+    """
+    metrics = [metric for metric in all_metrics().values() if metric.name != "drift"]
+    header = ["over all sequences", *(f"{metric.title} ({metric.unit})" for metric in metrics)]
+    rows = [
+        [metric.show(report["metrics"][metric.name]) for metric in metrics] for report in reports.values()
+    ]
+    return aligned([header, *([method, *row] for method, row in zip(reports, rows, strict=True))])
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:

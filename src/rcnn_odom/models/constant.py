@@ -1,61 +1,61 @@
-"""Constant motion: what a drift is worth that no laser has contributed to."""
+"""The same step for ever: what a drift is worth that no laser has contributed to."""
 
 import logging
-from collections.abc import Callable
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray
-from rcnn_odom.recordings.cache import EncodedSequence
-from rcnn_odom.recordings.recording import Sequence
-from rcnn_odom.training.datamodule import cut, parse_part
+from rcnn_odom.geometry import FloatArray, Steps
+from rcnn_odom.recordings.parts import cut, parse_part
+from rcnn_odom.recordings.recording import Drive, OpenRecording
 
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True)
-class ConstantMotion:
-    """The same motion for every pair of scans: the training set's mean, for instance.
+@dataclass(frozen=True, eq=False)
+class ConstantStep:
+    """The same step for every pair of scans: the training drives' mean, for instance.
 
     Attributes:
-        motion: (2,) metres and radians.
+        step: (3,) x and y in metres, heading in radians.
     """
 
-    motion: FloatArray
+    step: FloatArray
 
-    def estimate(self, scans: npt.ArrayLike) -> FloatArray:
-        """Motions (N-1, 2) for scans (N, bins)."""
-        return np.tile(self.motion, (len(np.asarray(scans)) - 1, 1))
+    def estimate(self, drive: Drive) -> Steps:
+        """The steps of one whole drive."""
+        return Steps.certain_of_nothing(np.tile(self.step, (len(drive) - 1, 1)))
 
 
-def held_motion() -> ConstantMotion:
+def held_motion() -> ConstantStep:
     """Repeats its own last estimate, and begins at rest: the odometry that never moves.
 
     It is what a matcher that holds its last motion on failure amounts to when it fails from the start.
     """
-    return ConstantMotion(np.zeros(2))
+    return ConstantStep(np.zeros(3))
 
 
-def mean_motion(read: Callable[[str], Sequence], names: list[str]) -> ConstantMotion | None:
-    """Repeats the mean motion of training drives; None, and a line in the log, where one cannot be read.
+def mean_step(open_recording: OpenRecording, names: Sequence[str]) -> FloatArray | None:
+    """The mean step (3,) of training drives; None, and a line in the log, where one cannot be read.
 
     Args:
-        read: name -> ``Sequence``, of which the truth is needed and no scan.
+        open_recording: name -> recording, of which the truth is needed and no scan.
         names: of the drives or of parts of them, as in ``data.train``.
     """
     try:
-        motions = [_without_scans(read, name).motions for name in names]
+        steps = [_without_scans(open_recording, name).steps for name in names]
     except InputError as error:
         log.info("mean_motion is left out, since not all of data.train can be read: %s", error)
         return None
-    return ConstantMotion(np.concatenate(motions).mean(0))
+    return np.concatenate(steps).mean(0)  # type: ignore[no-any-return]
 
 
-def _without_scans(read: Callable[[str], Sequence], name: str) -> EncodedSequence:
-    drive = read(parse_part(name)[0])
-    scans = np.empty((len(drive), 0), dtype=np.float32)
-    whole = EncodedSequence(drive.name, "", scans, drive.poses, drive.stamps, drive.camera_from_laser)
-    return cut({drive.name: whole}, name)
+def _without_scans(open_recording: OpenRecording, name: str) -> Drive:
+    recording = open_recording(parse_part(name)[0])
+    scans = np.empty((len(recording), 0), dtype=np.float32)
+    pose = recording.camera_from_laser
+    return cut(
+        {recording.name: Drive(recording.name, "", scans, recording.poses, recording.stamps, pose)}, name
+    )

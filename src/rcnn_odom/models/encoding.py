@@ -1,5 +1,6 @@
 """Points of one revolution -> depth vector (paper III-A). Nothing else knows about bins."""
 
+import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -7,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.recordings.scan import Scan
 
 
 @dataclass(frozen=True)
@@ -39,6 +41,17 @@ class Sensor:
     def bins(self) -> int:
         """Length of the depth vector: 3601 for the paper's sensor, the last bin closing the circle."""
         return round(self.field_of_view_deg / self.resolution_deg) + 1
+
+    def encode(self, scan: Scan) -> npt.NDArray[np.float32]:
+        """The depth vector (bins,) of a scan in metres.
+
+        Beams without bearings are spread evenly over the field of view.
+        """
+        bearings = scan.bearings
+        if bearings is None:
+            half, closes_circle = math.radians(self.field_of_view_deg) / 2, self.field_of_view_deg == 360
+            bearings = np.linspace(-half, half, len(scan.ranges), endpoint=not closes_circle)
+        return encode(bearings, scan.ranges, self)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for checkpoints and cache keys."""

@@ -7,15 +7,19 @@ at a quantile: a gate on the distance closes from step to step.
 """
 
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from numba import njit
 from scipy.spatial import cKDTree
 
-from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray, planar_to_poses, wrap_angle
+from rcnn_odom.geometry import FloatArray, Step, Steps, planar_to_poses, wrap_angle
+from rcnn_odom.models.contract import Description, Model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.options import option
+from rcnn_odom.recordings.recording import Drive
 
 LINE_REACH, LINE_GAP = 0.2, 0.2
 """Metres from a point to the neighbours that its line is fitted to, and between two of these: more is a jump
@@ -82,31 +86,9 @@ class Match:
     share: float
 
 
-@dataclass(frozen=True, eq=False)
-class Steps:
-    """What a matcher knows of a drive.
-
-    Attributes:
-        steps: (N-1, 3) x and y in metres and heading in radians, in the frame of the earlier scan.
-        failed: (N-1,) the match failed, and the step before stands in its place, as a whole or along what
-            the scans do not determine.
-    """
-
-    steps: FloatArray
-    failed: npt.NDArray[np.bool_]
-
-    @property
-    def poses(self) -> FloatArray:
-        """Laser poses (N, 4, 4), the first the identity."""
-        poses = [np.eye(4)]
-        for step in planar_to_poses(self.steps):
-            poses.append(poses[-1] @ step)
-        return np.array(poses)
-
-
 @dataclass(frozen=True)
 class PointToLineICP:
-    """Odometry from consecutive scans alone, without training.
+    """Finds the step between two scans.
 
     Attributes:
         sensor: of the depth vectors.
@@ -120,31 +102,6 @@ class PointToLineICP:
     beams: int = 450
     max_iterations: int = 30
     max_distance: float = 5.0
-
-    def __post_init__(self) -> None:
-        for name, value, kind in (
-            ("beams", self.beams, int),
-            ("max_iterations", self.max_iterations, int),
-            ("max_distance", self.max_distance, (int, float)),
-        ):
-            if isinstance(value, bool) or not isinstance(value, kind) or not 0 < value < float("inf"):
-                number = "a whole number" if kind is int else "a number"
-                raise InputError(f"model.{name}={value}: must be {number} above 0")
-
-    def estimate(self, scans: npt.ArrayLike) -> Steps:
-        """Steps between consecutive depth vectors (N, bins) in metres, 0 where there is no return.
-
-        The guess is the step before, at the beginning rest.
-        """
-        scans = np.asarray(scans)
-        steps, failed = np.zeros((len(scans) - 1, 3)), np.zeros(len(scans) - 1, dtype=bool)
-        earlier, guess = self.outline(scans[0]), np.zeros(3)
-        for frame, scan in enumerate(scans[1:]):
-            later = self.outline(scan)
-            match = self.match(earlier, later, guess)
-            steps[frame], failed[frame] = match.step, match.failed
-            earlier, guess = later, match.step
-        return Steps(steps, failed)
 
     def outline(self, scan: npt.ArrayLike) -> Outline:
         """Points and lines of one depth vector (bins,) in metres."""
@@ -208,6 +165,71 @@ class PointToLineICP:
         step -= unknown @ (unknown.T @ (step - guess))
         step[2] = wrap_angle(step[2])
         return Match(step, unknown.size > 0, len(residuals) / len(points))
+
+
+@dataclass(frozen=True)
+class ICPOptions:
+    """What ``conf/model`` sets: see :class:`PointToLineICP`."""
+
+    beams: int = option(above=0)
+    max_iterations: int = option(above=0)
+    max_distance: float = option(above=0)
+
+
+class ICP(Model):
+    """Odometry by matching each scan to the one before, without training.
+
+    Attributes:
+        failures: how many matches failed, by the name of each drive that was estimated. There the step
+            before stands in their place, as a whole or along what the scans do not determine.
+    """
+
+    name = "icp"
+    Options = ICPOptions
+
+    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
+        super().__init__(options, sensor)
+        self.matcher = PointToLineICP(sensor, **options)
+        self.failures: dict[str, int] = {}
+
+    def estimate(self, drive: Drive) -> Steps:
+        """The steps of one whole drive; how far off they are is not known."""
+        stepper = self.stepper()
+        matches = [stepper.match(*pair) for pair in pairwise(drive.scans)]
+        self.failures[drive.name] = sum(match.failed for match in matches)
+        return Steps.certain_of_nothing([match.step for match in matches])
+
+    def stepper(self) -> "ICPStepper":
+        """The same one pair of scans after the other."""
+        return ICPStepper(self.matcher)
+
+
+class ICPStepper:
+    """Scan matching in a stream. The guess is the step before, at the beginning rest."""
+
+    _outline: Outline
+
+    def __init__(self, matcher: PointToLineICP) -> None:
+        self.matcher, self.description = matcher, Description(matcher.sensor)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets all earlier pairs."""
+        self._scan: npt.NDArray[np.float32] = np.empty(0, np.float32)
+        self._guess = np.zeros(3)
+
+    def match(self, earlier: npt.NDArray[np.float32], later: npt.NDArray[np.float32]) -> Match:
+        """Matches the later of two depth vectors (bins,) to the earlier."""
+        # In a stream the earlier scan is the later one of the pair before.
+        same = np.array_equal(self._scan, earlier)
+        outlines = self._outline if same else self.matcher.outline(earlier), self.matcher.outline(later)
+        found = self.matcher.match(*outlines, self._guess)
+        self._scan, self._outline, self._guess = np.array(later), outlines[1], found.step
+        return found
+
+    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
+        """The step between two encoded scans (2, bins), the earlier first."""
+        return Step(*self.match(*pair).step)
 
 
 def _gauss_newton(

@@ -1,4 +1,4 @@
-"""Encoded scans: computed once in parallel, kept in one file a sequence, memory-mapped when read."""
+"""Encoded scans: computed once in parallel, kept in one file a recording, memory-mapped when read."""
 
 import hashlib
 import json
@@ -6,13 +6,10 @@ import logging
 import os
 import re
 import time
-from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import dataclass, replace
-from functools import cached_property
 from pathlib import Path
 from types import TracebackType
-from typing import IO
+from typing import IO, Any, Protocol
 
 import numpy as np
 import numpy.typing as npt
@@ -20,9 +17,9 @@ from tqdm import tqdm
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.files import one_at_a_time
-from rcnn_odom.geometry import FloatArray, change_frame, relative_motions
-from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings.recording import Drive, OpenRecording, Recording
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
@@ -33,94 +30,66 @@ CHECKSUM = hashlib.sha256
 """Of all that goes before it in a file of the cache, which it ends."""
 DAY = 86400.0
 
-OpenDrive = Callable[[str], Sequence]
 Encoded = tuple[npt.NDArray[np.float32], FloatArray]
 """Depth vectors (n, bins) and poses (n, 4, 4) of some frames of a drive."""
+
+
+class Encoder(Protocol):
+    """Turns scans into depth vectors, as :class:`rcnn_odom.models.encoding.Sensor` does."""
+
+    @property
+    def bins(self) -> int:
+        """Length of a depth vector."""
+
+    def as_dict(self) -> dict[str, Any]:
+        """All that the depth vectors depend on: part of the cache's key."""
+
+    def encode(self, scan: Scan) -> npt.NDArray[np.float32]:
+        """The depth vector of a scan, (bins,) metres."""
 
 
 class Encoding:
     """A task for workers: reads frames of a drive and encodes them.
 
     Args:
-        open_drive: name -> ``Sequence``, picklable.
-        sensor: what the depth vectors are like.
+        open_recording: name -> :class:`Recording`, picklable.
+        encoder: makes the depth vectors.
     """
 
-    def __init__(self, open_drive: OpenDrive, sensor: Sensor) -> None:
-        self.open_drive, self.sensor = open_drive, sensor
-        self._opened: dict[str, Sequence] = {}
+    def __init__(self, open_recording: OpenRecording, encoder: Encoder) -> None:
+        self.open_recording, self.encoder = open_recording, encoder
+        self._opened: dict[str, Recording] = {}
 
     def __call__(self, name: str, start: int, stop: int) -> Encoded:
         """Frames start..stop-1 of one drive."""
         if name not in self._opened:
             # One is enough: a worker's pieces of a drive follow each other.
-            self._opened = {name: self.open_drive(name)}
-        sequence = self._opened[name]
-        scans = np.stack([encode(*sequence.read_scan(frame), self.sensor) for frame in range(start, stop)])
-        return scans, sequence.poses[start:stop]
+            self._opened = {name: self.open_recording(name)}
+        recording = self._opened[name]
+        scans = [self.encoder.encode(recording.read_scan(frame)) for frame in range(start, stop)]
+        return np.stack(scans), recording.poses[start:stop]
 
 
-@dataclass(frozen=True)
-class EncodedSequence:
-    """A drive as the networks see it: ``Sequence`` with depth vectors (N, bins) in place of points.
-
-    ``key`` changes whenever the depth vectors do.
-    """
-
-    name: str
-    key: str
-    scans: npt.NDArray[np.float32]
-    poses: FloatArray
-    stamps: FloatArray
-    camera_from_laser: FloatArray
-    wheel_odometry: FloatArray | None = None
-
-    def __len__(self) -> int:
-        return len(self.scans)
-
-    @cached_property
-    def motions(self) -> FloatArray:
-        """True motions (N-1, 2) in metres and radians."""
-        return relative_motions(self.poses)
-
-    @property
-    def camera_poses(self) -> FloatArray:
-        """True poses (N, 4, 4) in the frame of the trajectory files."""
-        return change_frame(self.poses, self.camera_from_laser)
-
-    def part(self, start: int, stop: int, name: str | None = None) -> "EncodedSequence":
-        """Frames start..stop-1, without a copy."""
-        wheel = self.wheel_odometry
-        return replace(
-            self,
-            name=name or self.name,
-            scans=self.scans[start:stop],
-            poses=self.poses[start:stop],
-            stamps=self.stamps[start:stop],
-            wheel_odometry=None if wheel is None else wheel[start:stop],
-        )
-
-
-def cache_path(sequence: Sequence, sensor: Sensor, folder: Path) -> Path:
+def cache_path(recording: Recording, encoder: Encoder, folder: Path) -> Path:
     """Where the encoded scans belong: the name holds a hash of everything that changes them."""
-    parts = [ENCODING_VERSION, sensor.as_dict(), sequence.fingerprint, len(sequence)]
+    parts = [ENCODING_VERSION, encoder.as_dict(), recording.fingerprint, len(recording)]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-    plain_name = re.sub(r"[^\w.~-]+", "_", sequence.name)
+    plain_name = re.sub(r"[^\w.~-]+", "_", recording.name)
     return folder / f"{plain_name}-{key}.npy"
 
 
-def encode_sequences(
-    sequences: list[Sequence],
-    sensor: Sensor,
+def encode_recordings(
+    recordings: list[Recording],
+    encoder: Encoder,
     folder: Path,
     workers: int,
     pool: Workers[Encoded] | None = None,
-) -> list[EncodedSequence]:
-    """The sequences with their depth vectors, from the cache or computed into it in parallel.
+) -> list[Drive]:
+    """The recordings with their depth vectors, from the cache or computed into it in parallel.
 
     Args:
-        sequences: of names that differ.
-        sensor: what the depth vectors are like.
+        recordings: of names that differ.
+        encoder: makes the depth vectors.
         folder: of the cache.
         workers: processes to start where something is missing.
         pool: processes that run already, whose :class:`Encoding` opens drives by these names; it is used
@@ -129,39 +98,39 @@ def encode_sequences(
     Raises:
         InputError: a frame cannot be read, or the folder cannot be made or is full.
     """
-    scans = [open_cached(sequence, sensor, folder) for sequence in sequences]
+    scans = [open_cached(recording, encoder, folder) for recording in recordings]
     if any(found is None for found in scans):
         _make_folder(folder)
         with one_at_a_time(folder, "encoding", "encoding scans"):
             # Another process may have been faster.
-            missing = [s for s, found in zip(sequences, scans, strict=True) if found is None]
-            missing = [sequence for sequence in missing if open_cached(sequence, sensor, folder) is None]
-            _encode(missing, sensor, folder, workers, pool)
-        scans = [open_cached(sequence, sensor, folder) for sequence in sequences]
-    encoded = []
-    for sequence, found in zip(sequences, scans, strict=True):
-        assert found is not None, sequence.name
-        encoded.append(
-            EncodedSequence(
-                name=sequence.name,
-                key=cache_path(sequence, sensor, folder).stem,
-                scans=found,
-                poses=sequence.poses,
-                stamps=sequence.stamps,
-                camera_from_laser=sequence.camera_from_laser,
-                wheel_odometry=sequence.wheel_odometry,
-            )
+            missing = [one for one, found in zip(recordings, scans, strict=True) if found is None]
+            missing = [recording for recording in missing if open_cached(recording, encoder, folder) is None]
+            _encode(missing, encoder, folder, workers, pool)
+        scans = [open_cached(recording, encoder, folder) for recording in recordings]
+    drives = [
+        Drive(
+            name=recording.name,
+            key=cache_path(recording, encoder, folder).stem,
+            scans=found,
+            poses=recording.poses,
+            stamps=recording.stamps,
+            camera_from_laser=recording.camera_from_laser,
+            wheel_odometry=recording.wheel_odometry,
         )
-    return encoded
+        for recording, found in zip(recordings, scans, strict=True)
+        if found is not None
+    ]
+    assert len(drives) == len(recordings)
+    return drives
 
 
-def open_cached(sequence: Sequence, sensor: Sensor, folder: Path) -> npt.NDArray[np.float32] | None:
-    """A map of a sequence's depth vectors (N, bins) in the cache; None where they are not there.
+def open_cached(recording: Recording, encoder: Encoder, folder: Path) -> npt.NDArray[np.float32] | None:
+    """A map of a recording's depth vectors (N, bins) in the cache; None where they are not there.
 
     The file is read once to compare its checksum: what a failing disk or a stranger has changed is told and
     not used. Nothing in it is ever run.
     """
-    path = cache_path(sequence, sensor, folder)
+    path = cache_path(recording, encoder, folder)
     try:
         with path.open("rb") as file:
             body = path.stat().st_size - CHECKSUM().digest_size
@@ -172,7 +141,7 @@ def open_cached(sequence: Sequence, sensor: Sensor, folder: Path) -> npt.NDArray
         return None
     except (ValueError, EOFError, OSError):
         scans = None
-    if scans is not None and (scans.shape, scans.dtype) == ((len(sequence), sensor.bins), np.float32):
+    if scans is not None and (scans.shape, scans.dtype) == ((len(recording), encoder.bins), np.float32):
         return scans
     log.warning("%s: damaged or of an older version, encoding it again", path)
     return None
@@ -199,25 +168,25 @@ def _make_folder(folder: Path) -> None:
 
 
 def _encode(
-    missing: list[Sequence], sensor: Sensor, folder: Path, workers: int, pool: Workers[Encoded] | None
+    missing: list[Recording], encoder: Encoder, folder: Path, workers: int, pool: Workers[Encoded] | None
 ) -> None:
     if not missing:
         return
-    lengths, total = [len(sequence) for sequence in missing], sum(map(len, missing))
+    lengths, total = [len(recording) for recording in missing], sum(map(len, missing))
     with ExitStack() as stack:
         quiet = pool is not None
         if pool is None:
-            log.info("encoding %d scans of %d sequences into %s", total, len(missing), folder)
-            drives = {sequence.name: sequence for sequence in missing}
-            encoding = Encoding(drives.__getitem__, sensor)
+            log.info("encoding %d scans of %d recordings into %s", total, len(missing), folder)
+            by_name = {recording.name: recording for recording in missing}
+            encoding = Encoding(by_name.__getitem__, encoder)
             pool = stack.enter_context(Workers(useful_workers(workers, total), encoding))
         bar = tqdm(total=total, desc="encoding scans", unit="scan", disable=quiet or None)
         stack.enter_context(bar)
         files = [
-            stack.enter_context(_PartialFile(cache_path(sequence, sensor, folder), (length, sensor.bins)))
-            for sequence, length in zip(missing, lengths, strict=True)
+            stack.enter_context(_PartialFile(cache_path(recording, encoder, folder), (length, encoder.bins)))
+            for recording, length in zip(missing, lengths, strict=True)
         ]
-        for (number, start, _), (scans, _) in pool.run([sequence.name for sequence in missing], lengths):
+        for (number, start, _), (scans, _) in pool.run([recording.name for recording in missing], lengths):
             files[number].write(start, scans)
             bar.update(len(scans))
 

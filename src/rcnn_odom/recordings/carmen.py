@@ -24,8 +24,9 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, planar_to_poses, wrap_angle
-from rcnn_odom.recordings.formats import Scan, ScanStream
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
 
 log = logging.getLogger(__name__)
 
@@ -44,7 +45,7 @@ def load(
     reference: str | Path | None = None,
     field_of_view_deg: float = 180.0,
     max_range: float | None = None,
-) -> Sequence:
+) -> Recording:
     """One CARMEN log, its scans in the order of the file.
 
     The truth is the laser pose on the line, or that of the reference. Wheel odometry is the line's odom
@@ -66,26 +67,31 @@ def load(
     if not 0 < field_of_view_deg <= 360:
         raise InputError(f"data.field_of_view_deg must be above 0 and at most 360, not {field_of_view_deg}")
     path = _find_log(Path(root), name)
-    lines, other_lasers = _read_log(path, field_of_view_deg)
+    other_lasers: Counter[str] = Counter()
+    lines = list(_laser_lines(path, field_of_view_deg, other_lasers, strict=True))
     beams = Beams.of(lines)
-    stamps = np.array([line.stamp for line in lines])
     if reference is None:
         poses, about_truth = planar_to_poses([line.laser for line in lines]), _name_truth(lines)
     else:
         poses, about_truth = _read_truth(_find_reference(Path(reference), name), len(lines))
     notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
-    notes += [*_check_stamps(stamps), *about_truth]
+    notes += [*_check_stamps(beams.stamps), *about_truth]
     status = path.stat()
     key = f"carmen {READER_VERSION} {path.name} {status.st_size} {status.st_mtime_ns} {field_of_view_deg!r}"
-    return Sequence(
+    return Recording(
         name=name,
         poses=poses,
-        stamps=stamps,
+        stamps=beams.stamps,
         read_scan=beams,
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
         wheel_odometry=_wheel_odometry(lines),
         notes=tuple(notes),
     )
+
+
+def recognises(path: Path) -> bool:
+    """Any file may be a log: nothing but its lines tells."""
+    return path.is_file()
 
 
 def stream(path: Path, field_of_view_deg: float = 180.0) -> ScanStream:
@@ -102,31 +108,49 @@ def stream(path: Path, field_of_view_deg: float = 180.0) -> ScanStream:
         InputError: the file cannot be read to its end, or has no scan; raised where ``scans`` is read.
     """
     skipped: Counter[str] = Counter()
-    scans = _stream_scans(path, field_of_view_deg, skipped)
+    lines = _laser_lines(path, field_of_view_deg, skipped, strict=False)
+    scans = (Beams.of([line])(0) for line in lines)
     return ScanStream(name=path.name, scans=scans, has_clock=False, skipped=skipped)
 
 
-def _stream_scans(path: Path, field_of_view_deg: float, skipped: Counter[str]) -> Iterator[Scan]:
+def _laser_lines(
+    path: Path, field_of_view_deg: float, others: Counter[str], strict: bool
+) -> Iterator["LaserLine"]:
+    """The laser lines in order; counts those of other lasers that are passed over.
+
+    Args:
+        path: of the log.
+        field_of_view_deg: degrees that the beams of FLASER lines cover.
+        others: what was passed over.
+        strict: broken lines and a second kind of lines are refused, not passed over.
+    """
     first_kind = None
     for number, text in _lines_of(path):
         kind = text.split(None, 1)[0] if text.strip() else ""
-        if kind not in READ or first_kind not in (None, kind):
+        if kind not in READ or (not strict and first_kind not in (None, kind)):
             if "LASER" in kind and not kind.startswith("#"):
-                skipped[f"{kind} lines"] += 1
+                others[f"{kind} lines"] += 1
             continue
+        broken = f"{path}:{number}: broken {kind} line"
         try:
             line = _parse(text, field_of_view_deg)
         except ValueError as error:
-            skipped["broken lines"] += 1
-            log.warning("%s:%d: broken %s line (%s), skipped", path, number, kind, error)
+            if strict:
+                raise InputError(f"{broken} ({error}); correct or remove it") from error
+            others["broken lines"] += 1
+            log.warning("%s (%s), skipped", broken, error)
             continue
+        if first_kind not in (None, kind):
+            raise InputError(
+                f"{path}:{number}: {kind} after {first_kind} lines, perhaps the same scans twice; "
+                "keep one kind of them"
+            )
         first_kind = kind
-        angles, ranges = Beams.of([line])(0)
-        yield Scan(ranges, angles, line.stamp)
+        yield line
     if first_kind is None:
-        others = f", only {', '.join(sorted(skipped))}" if skipped else ""
+        found = f", only {', '.join(sorted(others))}" if others else ""
         raise InputError(
-            f"{path}: no FLASER or ROBOTLASER1 line in it{others}; convert the log to one of them"
+            f"{path}: no FLASER or ROBOTLASER1 line in it{found}; convert the log to one of them"
         )
 
 
@@ -143,14 +167,14 @@ class LaserLine(NamedTuple):
     first_angle: float
     spacing: float
     maximum: float
+    stamp: float
     laser: list[float]
     robot: list[float]
-    stamp: float
 
 
 @dataclass(frozen=True, eq=False)
 class Beams:
-    """Frame index -> angles in radians and ranges in metres, both (P,), from memory.
+    """Frame index -> all beams of its scan, from memory.
 
     Beams run counter-clockwise from the right. FLASER lines do not say at which angles, so an even
     number n leaves the field of view open at its left end (SICK's 180 of 181 beams, spacing
@@ -166,6 +190,7 @@ class Beams:
     first_angle: FloatArray
     spacing: FloatArray
     maximum: FloatArray
+    stamps: FloatArray
 
     @classmethod
     def of(cls, lines: list[LaserLine]) -> "Beams":
@@ -173,14 +198,15 @@ class Beams:
         return cls(
             np.concatenate([line.readings for line in lines]),
             np.cumsum([0, *(len(line.readings) for line in lines)]),
-            *(np.array(column) for column in zip(*(line[2:5] for line in lines), strict=True)),
+            *(np.array(column) for column in zip(*(line[2:6] for line in lines), strict=True)),
         )
 
-    def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Angles and ranges of one frame; infinite range: the line itself calls it no return."""
+    def __call__(self, frame: int) -> Scan:
+        """One frame; infinite range: the line itself calls it no return."""
         ranges = self.readings[self.offsets[frame] : self.offsets[frame + 1]]
-        angles = self.first_angle[frame] + self.spacing[frame] * np.arange(len(ranges))
-        return angles, np.where(ranges >= self.maximum[frame], np.inf, ranges)
+        bearings = self.first_angle[frame] + self.spacing[frame] * np.arange(len(ranges))
+        ranges = np.where(ranges >= self.maximum[frame], np.inf, ranges)
+        return Scan(ranges, bearings, stamp=float(self.stamps[frame]))
 
 
 def _find_log(root: Path, name: str) -> Path:
@@ -214,36 +240,6 @@ def _lines_of(path: Path) -> Iterator[tuple[int, str]]:
             yield from enumerate(stream, start=1)
     except (EOFError, OSError, zlib.error) as error:
         raise InputError(f"{path}: cannot be read to its end ({error}); download it again") from error
-
-
-def _read_log(path: Path, field_of_view_deg: float) -> tuple[list[LaserLine], Counter[str]]:
-    """All laser lines in order, and how many lines of other lasers were passed over."""
-    lines: list[LaserLine] = []
-    others: Counter[str] = Counter()
-    for number, text in _lines_of(path):
-        kind = text.split(None, 1)[0] if text.strip() else ""
-        if kind not in READ:
-            if "LASER" in kind and not kind.startswith("#"):
-                others[kind] += 1
-            continue
-        try:
-            line = _parse(text, field_of_view_deg)
-        except ValueError as error:
-            raise InputError(
-                f"{path}:{number}: broken {kind} line ({error}); correct or remove it"
-            ) from error
-        if lines and lines[0].kind != kind:
-            raise InputError(
-                f"{path}:{number}: {kind} after {lines[0].kind} lines, perhaps the same scans twice; "
-                "keep one kind of them"
-            )
-        lines.append(line)
-    if not lines:
-        others_found = f", only {', '.join(sorted(others))}" if others else ""
-        raise InputError(
-            f"{path}: no FLASER or ROBOTLASER1 line in it{others_found}; convert the log to one of them"
-        )
-    return lines, others
 
 
 def _parse_flaser(fields: list[str], field_of_view_deg: float) -> LaserLine:

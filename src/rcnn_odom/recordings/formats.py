@@ -1,92 +1,129 @@
-"""Scans one after the other, for an odometer: the formats behind one door, none read into memory."""
+"""One interface for all formats of recordings, those of other packages too.
 
-from collections import Counter
-from collections.abc import Iterator
-from dataclasses import dataclass, field
+A format is a module. ``load(name, **options) -> Recording`` makes it one to train on; ``recognises(path) ->
+bool`` and ``stream(path, **options) -> ScanStream`` make it one to stream.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+from inspect import signature
 from pathlib import Path
-from typing import NamedTuple
+from types import ModuleType
+from typing import Any, Protocol
 
 import numpy as np
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray
-from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.recording import OpenRecording
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
+from rcnn_odom.registry import choose, collect, modules_in
 
 
-class Scan(NamedTuple):
-    """Beams or returns of one revolution: angles in radians and ranges in metres, (P,); a stamp in seconds.
+def all_formats() -> dict[str, ModuleType]:
+    """The formats by their names, in the order in which they are asked whether they know a recording.
 
-    ``angles`` is None where only the sensor says them; ``ranges`` may then be points (P, 2).
+    Raises:
+        InputError: one that another package adds has the name of another, or lacks a part.
     """
+    modules = {module.__name__.rpartition(".")[2]: module for module in modules_in("rcnn_odom.recordings")}
+    own = {name: module for name, module in modules.items() if {"load", "recognises"} & set(dir(module))}
+    formats = collect("recording format", own, _check)
+    formats["carmen"] = formats.pop("carmen")  # last, since it knows any file
+    return {name: formats[name] for name in sorted(formats, key=lambda name: name in own)}
 
-    ranges: FloatArray
-    angles: FloatArray | None
-    stamp: float | None
+
+def _check(name: str, module: Any) -> None:
+    missing = [part for part in ("recognises", "stream") if not callable(getattr(module, part, None))]
+    if missing == ["recognises", "stream"] and callable(getattr(module, "load", None)):
+        return
+    if missing:
+        raise InputError(
+            f"recording format {name} has no {' and no '.join(missing)}; it needs load, or recognises and "
+            "stream, or all three"
+        )
 
 
-@dataclass
-class ScanStream:
-    """A recording or a live source.
+def find_format(name: str) -> ModuleType:
+    """The format of this name, one to train on.
 
-    Attributes:
-        name: as a user would name it.
-        scans: in their order. Raises InputError where it breaks off.
-        total: how many scans there are, if that is known.
-        has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
-        beams: degrees that they cover, and degrees between them; None: as the angles of a scan say.
-        camera_from_laser: (4, 4), the frame in which trajectories are written.
-        notes: what the reader noticed, in words for the user.
-        skipped: what could not be read and was passed over, counted while ``scans`` is read.
+    Raises:
+        InputError: there is none, or it has no ``load``.
     """
-
-    name: str
-    scans: Iterator[Scan]
-    total: int | None = None
-    has_clock: bool = True
-    beams: tuple[float, float] | None = None
-    camera_from_laser: FloatArray = field(default_factory=FORWARD_CAMERA.copy)
-    notes: tuple[str, ...] = ()
-    skipped: Counter[str] = field(default_factory=Counter)
+    found: ModuleType = choose("recording format", name, all_formats())
+    if not hasattr(found, "load"):
+        raise InputError(
+            f"recording format {name} has no load, so that it only streams; choose another data.reader.format"
+        )
+    return found
 
 
-def open_stream(
-    path: Path, *, topic: str | None = None, ring: int | None = None, field_of_view_deg: float = 180.0
-) -> ScanStream:
-    """A recording by what it looks like: KITTI sequence folder, ROS bag or CARMEN log.
+def open_recording(reader: Mapping[str, Any]) -> OpenRecording:
+    """What opens recordings by their names.
+
+    Args:
+        reader: ``format``, and the options of its ``load``.
+
+    Raises:
+        InputError: there is no such format, or it lacks an option or does not take one.
+    """
+    options = dict(reader)
+    name = options.pop("format", None)
+    load = find_format(name).load
+    try:
+        signature(load).bind("any name", **options)
+    except TypeError as error:
+        raise InputError(
+            f"data.reader: {error}; {name} has {', '.join(signature(load).parameters)}"
+        ) from error
+    return partial(load, **options)
+
+
+def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStream:
+    """A recording by what it looks like: KITTI folder, ROS bag, CARMEN log or one of another package.
 
     Args:
         path: of it.
-        topic: of a bag's LaserScan; None: its only one.
-        ring: of a KITTI sequence; None: the most level one.
-        field_of_view_deg: of a CARMEN log's FLASER lines.
+        options: ``topic`` of a bag's LaserScan, ``ring`` of a KITTI sequence, ``field_of_view_deg`` of a
+            CARMEN log's FLASER lines; each format takes its own, and None is left out.
 
     Raises:
         InputError: nothing of the kind, or it cannot be read.
     """
-    from rcnn_odom.recordings import carmen, kitti, rosbag
-
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a KITTI sequence, a CARMEN log or a ROS bag")
-    if path.is_dir() and (path / "velodyne").is_dir():
-        return kitti.stream(path, ring)
-    if path.suffix in rosbag.SUFFIXES or (path / rosbag.METADATA).exists():
-        return rosbag.stream(path, topic)
-    if path.is_dir():
-        raise InputError(
-            f"{path}: neither a KITTI sequence (no velodyne/ in it; name sequences/05) nor a ROS 2 bag (no "
-            f"{rosbag.METADATA})"
-        )
-    return carmen.stream(path, field_of_view_deg)
+    for found in all_formats().values():
+        if hasattr(found, "recognises") and found.recognises(path):
+            taken = signature(found.stream).parameters
+            given = {name: value for name, value in (options or {}).items() if value is not None}
+            stream: ScanStream = found.stream(path, **{name: given[name] for name in given if name in taken})
+            return stream
+    raise InputError(
+        f"{path}: neither a KITTI sequence (no velodyne/ in it; name sequences/05) nor a ROS 2 bag (no "
+        "metadata.yaml)"
+    )
 
 
-def need_fitting_scan(stream: ScanStream, scan: Scan, sensor: Sensor) -> None:
-    """Compares the beams of a scan with what a network was trained for; points do not say theirs.
+class Spacing(Protocol):
+    """The laser for which a network was trained."""
+
+    @property
+    def field_of_view_deg(self) -> float:
+        """Degrees that it covers."""
+
+    @property
+    def resolution_deg(self) -> float:
+        """Degrees between the bins."""
+
+
+def need_fitting_scan(stream: ScanStream, scan: Scan, sensor: Spacing) -> None:
+    """Compares the beams of a scan with what a network was trained for; returns alone do not tell of them.
 
     Raises:
         InputError: they cover another part of the circle, or are too far apart or too close for its bins.
     """
     beams = stream.beams
-    if beams is None and scan.ranges.ndim == 1:
+    if beams is None and scan.has_all_beams:
         beams = _beams_of(scan, sensor)
     if beams is None:
         return
@@ -102,10 +139,10 @@ def need_fitting_scan(stream: ScanStream, scan: Scan, sensor: Sensor) -> None:
         )
 
 
-def _beams_of(scan: Scan, sensor: Sensor) -> tuple[float, float]:
-    """Degrees that the beams cover, and degrees between them; without angles they cover the sensor's."""
+def _beams_of(scan: Scan, sensor: Spacing) -> tuple[float, float]:
+    """Degrees that the beams cover, and degrees between them; without bearings they cover the sensor's."""
     count = len(scan.ranges)
-    if scan.angles is None:
+    if scan.bearings is None:
         return sensor.field_of_view_deg, sensor.field_of_view_deg / max(count - 1, 1)
-    spacing = float(np.rad2deg(np.median(np.abs(np.diff(scan.angles))))) if count > 1 else 360.0
+    spacing = float(np.rad2deg(np.median(np.abs(np.diff(scan.bearings))))) if count > 1 else 360.0
     return spacing * count, spacing

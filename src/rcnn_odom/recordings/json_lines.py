@@ -13,7 +13,8 @@ from typing import Any
 
 import numpy as np
 
-from rcnn_odom.recordings.formats import Scan, ScanStream
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
 
 log = logging.getLogger(__name__)
 
@@ -53,15 +54,16 @@ def parse(line: str) -> Scan:
     stamp = None if content.get("stamp") is None else float(content["stamp"])
     if "points" in content:
         points = np.array([[_number(x), _number(y)] for x, y, *_ in content["points"]]).reshape(-1, 2)
-        return Scan(points, None, stamp)
+        return Scan.from_points(points, stamp)
     if not isinstance(content.get("ranges"), list):
         raise ValueError("neither a list of ranges nor of points in it")
     ranges = np.array([_number(value) for value in content["ranges"]])
-    if "angle_min" not in content:
-        return Scan(ranges, None, stamp)
-    with np.errstate(over="ignore", invalid="ignore"):  # the encoder leaves out angles that are no numbers
-        steps = float(content["angle_increment"]) * np.arange(len(ranges), dtype=np.float64)
-        return Scan(ranges, float(content["angle_min"]) + steps, stamp)
+    bearings = None
+    if "angle_min" in content:
+        with np.errstate(over="ignore", invalid="ignore"):  # encoders leave out bearings that are no numbers
+            steps = float(content["angle_increment"]) * np.arange(len(ranges), dtype=np.float64)
+            bearings = float(content["angle_min"]) + steps
+    return Scan(ranges, bearings, stamp=stamp)
 
 
 def _number(value: Any) -> float:

@@ -5,7 +5,6 @@ Layout: ``root/sequences/NAME/{velodyne/*.bin,calib.txt,times.txt}`` and ``root/
 
 import hashlib
 import os
-from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -14,8 +13,9 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, change_frame
-from rcnn_odom.recordings.formats import Scan, ScanStream
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import is_rotation, read_kitti
 
 READER_VERSION = 2
@@ -40,7 +40,7 @@ sequences; the upper one is also the one that a pitching car turns into the road
 Points = npt.NDArray[np.float32]
 
 
-def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
+def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
     """One sequence of the KITTI odometry data.
 
     The truth is that of the laser: the poses on disk are the camera's and are moved with ``Tr``.
@@ -67,9 +67,9 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
     stamps = _read_stamps(folder / "times.txt")
     camera_poses = _read_poses(root / "poses" / f"{name}.txt")
     _need_same_number(folder, len(scans), len(stamps), len(camera_poses))
-    reader, chosen = _choose_ring(scans, ring)
+    reader, chosen = _choose_ring(scans, stamps, ring)
     key = f"kitti {READER_VERSION} {reader.ring} {fingerprint_of_files}"
-    return Sequence(
+    return Recording(
         name=name,
         poses=change_frame(camera_poses, np.linalg.inv(camera_from_laser)),
         stamps=stamps,
@@ -80,32 +80,32 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Sequence:
     )
 
 
-def stream(folder: Path, ring: int | None = None) -> ScanStream:
+def recognises(path: Path) -> bool:
+    """Whether it is the folder of a sequence."""
+    return (path / "velodyne").is_dir()
+
+
+def stream(path: Path, ring: int | None = None) -> ScanStream:
     """The scans of a sequence's folder, one after the other; its truth is not needed.
 
     Args:
-        folder: ``sequences/NAME``.
+        path: ``sequences/NAME``.
         ring: as for :func:`load`.
 
     Raises:
         InputError: a file is missing, cut off or not as the format says.
     """
-    scans, _ = _list_scans(folder / "velodyne")
-    camera_from_laser = read_calibration(folder / "calib.txt")
-    stamps = _read_stamps(folder / "times.txt")
+    scans, _ = _list_scans(path / "velodyne")
+    camera_from_laser = read_calibration(path / "calib.txt")
+    stamps = _read_stamps(path / "times.txt")
     if len(stamps) != len(scans):
         raise InputError(
-            f"{folder}: {len(scans)} scans in velodyne/, but {len(stamps)} lines in times.txt; copy it again"
+            f"{path}: {len(scans)} scans in velodyne/, but {len(stamps)} lines in times.txt; copy it again"
         )
-    reader, chosen = _choose_ring(scans, ring)
-
-    def read() -> Iterator[Scan]:
-        for frame, stamp in enumerate(stamps):
-            yield Scan(reader.points(frame), None, float(stamp))
-
+    reader, chosen = _choose_ring(scans, stamps, ring)
     return ScanStream(
-        name=folder.resolve().name,
-        scans=read(),
+        name=path.resolve().name,
+        scans=map(reader, range(len(scans))),
         total=len(scans),
         beams=VELODYNE,
         camera_from_laser=camera_from_laser,
@@ -113,7 +113,7 @@ def stream(folder: Path, ring: int | None = None) -> ScanStream:
     )
 
 
-def _choose_ring(scans: list[Path], ring: int | None) -> tuple["RingReader", str]:
+def _choose_ring(scans: list[Path], stamps: FloatArray, ring: int | None) -> tuple["RingReader", str]:
     """The reader of one ring for all scans, and words about it."""
     elevations = _ring_elevations(scans)
     if ring is None:
@@ -125,12 +125,12 @@ def _choose_ring(scans: list[Path], ring: int | None) -> tuple["RingReader", str
         )
     elevation = float(elevations[ring])
     chosen = f"ring {ring} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"
-    return RingReader(tuple(map(str, scans)), ring, elevation), chosen
+    return RingReader(tuple(map(str, scans)), ring, elevation, tuple(stamps.tolist())), chosen
 
 
 @dataclass(frozen=True)
 class RingReader:
-    """Frame index -> angles in radians and horizontal ranges in metres of one ring, both (P,).
+    """Frame index -> the returns of one ring, their ranges horizontal.
 
     A frame in which an earlier ring was split or lost has its rings elsewhere in the file: where the
     ring's elevation (radians) is far from the sequence's, the neighbour that has it is taken.
@@ -139,14 +139,10 @@ class RingReader:
     paths: tuple[str, ...]
     ring: int
     elevation: float
+    stamps: tuple[float, ...]
 
-    def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Read one frame; raises as :meth:`points`."""
-        x, y = self.points(frame).T
-        return np.arctan2(y, x), np.hypot(x, y)
-
-    def points(self, frame: int) -> FloatArray:
-        """The ring's returns in one frame: x and y in metres, (P, 2).
+    def __call__(self, frame: int) -> Scan:
+        """Reads one frame.
 
         Raises:
             InputError: the frame cannot be read or has no such ring.
@@ -159,7 +155,7 @@ class RingReader:
                 f"{path}: frame {frame} has {len(starts)} rings, so no ring {self.ring} (they count "
                 "from 0); choose a smaller data.ring, or download the file again"
             )
-        return self._find_ring(_split_rings(points, starts))[:, :2].astype(np.float64)
+        return Scan.from_points(self._find_ring(_split_rings(points, starts)), self.stamps[frame])
 
     def _find_ring(self, rings: list[Points]) -> Points:
         def distance(ring: Points) -> float:

@@ -12,7 +12,7 @@ from tqdm import tqdm
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, change_frame
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.trajectory import write_kitti
 from rcnn_odom.recordings.workers import Workers, useful_workers
 
@@ -29,7 +29,7 @@ round numbers. Nothing is rendered with them, but readers expect P0 to P3."""
 
 @runtime_checkable
 class PointReader(Protocol):
-    """A ``read_scan`` that also gives the points it makes angles and ranges of."""
+    """A ``read_scan`` that also gives the points it makes scans of."""
 
     def points(self, frame: int) -> Points:
         """x, y, z in metres in the laser's frame and reflectance, (P, 4), by azimuth in [0, 2 pi)."""
@@ -48,7 +48,7 @@ def need_free_name(root: Path, name: str) -> None:
             raise InputError(f"{path}: is there already; remove it, or choose another --out or --sequence")
 
 
-def export_kitti(sequence: Sequence, root: Path) -> None:
+def export_kitti(sequence: Recording, root: Path) -> None:
     """Write a sequence, whose ``read_scan`` is a `PointReader`, below ``root`` in KITTI's layout.
 
     The poses are told in the camera's frame and begin with the identity, as KITTI's do; what `kitti.load`

@@ -1,25 +1,30 @@
-"""What every recording looks like once it has been read."""
+"""What every recording looks like once it has been opened, and a drive as estimators are given it."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
+import numpy.typing as npt
 
-from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray
+from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame, motions_of, relative_steps
+from rcnn_odom.recordings.scan import Scan
 
-ReadScan = Callable[[int], tuple[FloatArray, FloatArray]]
-"""Frame index -> angles in radians (0 ahead, counter-clockwise) and ranges in metres, both (P,)."""
+ReadScan = Callable[[int], Scan]
+"""Frame number -> its scan."""
+OpenRecording = Callable[[str], "Recording"]
+"""Name -> the recording; picklable, since encoding runs in processes."""
 
 
 @dataclass(frozen=True)
-class Sequence:
+class Recording:
     """One drive: scans in file order with the truth about where each was taken.
 
     Attributes:
         name: as a user names it, for instance ``05`` or ``mit-killian``.
         poses: (N, 4, 4) laser to world. nan where the truth is unknown.
         stamps: (N,) seconds.
-        read_scan: returns of one frame; a picklable callable, since encoding runs in processes.
+        read_scan: one frame's scan; a picklable callable, since encoding runs in processes.
         fingerprint: changes whenever ``read_scan`` would return something else: the cache's key.
         camera_from_laser: (4, 4), KITTI's ``Tr``: the frame in which trajectories are written.
         wheel_odometry: (N, 4, 4) laser poses by the robot's own odometry, where the log has them.
@@ -41,3 +46,55 @@ class Sequence:
     def __post_init__(self) -> None:
         assert self.poses.shape == (len(self.stamps), 4, 4), (self.name, self.poses.shape)
         assert self.poses.dtype == self.stamps.dtype == np.float64
+
+
+@dataclass(frozen=True)
+class Drive:
+    """A recording, or a part of one, as estimators and scores are given it.
+
+    Attributes:
+        name: of the recording; of a part ``NAME[a:b]``.
+        key: changes whenever ``scans`` does.
+        scans: (N, bins) float32, the encoded scans: depth vectors in metres.
+        poses: (N, 4, 4) true laser poses.
+        stamps: (N,) seconds.
+        camera_from_laser, wheel_odometry: as in :class:`Recording`.
+    """
+
+    name: str
+    key: str
+    scans: npt.NDArray[np.float32]
+    poses: FloatArray
+    stamps: FloatArray
+    camera_from_laser: FloatArray
+    wheel_odometry: FloatArray | None = None
+
+    def __len__(self) -> int:
+        return len(self.scans)
+
+    @cached_property
+    def steps(self) -> FloatArray:
+        """True steps (N-1, 3): x and y in metres, heading in radians."""
+        return relative_steps(self.poses)
+
+    @property
+    def motions(self) -> FloatArray:
+        """The paper's two numbers of the true steps, (N-1, 2): metres and radians."""
+        return motions_of(self.steps)
+
+    @property
+    def camera_poses(self) -> FloatArray:
+        """True poses (N, 4, 4) in the frame of the trajectory files."""
+        return change_frame(self.poses, self.camera_from_laser)
+
+    def part(self, start: int, stop: int, name: str | None = None) -> "Drive":
+        """Frames start..stop-1, without a copy."""
+        wheel = self.wheel_odometry
+        return replace(
+            self,
+            name=name or self.name,
+            scans=self.scans[start:stop],
+            poses=self.poses[start:stop],
+            stamps=self.stamps[start:stop],
+            wheel_odometry=None if wheel is None else wheel[start:stop],
+        )

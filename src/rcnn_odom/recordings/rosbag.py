@@ -8,12 +8,18 @@ from typing import Any
 import numpy as np
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.recordings.formats import Scan, ScanStream
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.stream import ScanStream
 
 SUFFIXES = (".bag", ".mcap", ".db3")
 METADATA = "metadata.yaml"
 """What the folder of a ROS 2 bag holds."""
 LASER_SCAN = "sensor_msgs/msg/LaserScan"
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is named like a bag, or is the folder of one."""
+    return path.suffix in SUFFIXES or (path / METADATA).exists()
 
 
 def stream(path: Path, topic: str | None = None) -> ScanStream:
@@ -109,7 +115,13 @@ def convert(message: Any, arrival: int = 0) -> Scan:
         arrival: nanoseconds, in place of a stamp of 0.
     """
     ranges = np.asarray(message.ranges, dtype=np.float64)
-    angles = message.angle_min + message.angle_increment * np.arange(len(ranges))
+    beam = np.arange(len(ranges))
     returned = (ranges >= message.range_min) & (ranges < message.range_max)
     stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-    return Scan(np.where(returned, ranges, 0.0), angles, stamp or 1e-9 * arrival)
+    return Scan(
+        ranges=np.where(returned, ranges, 0.0),
+        bearings=message.angle_min + message.angle_increment * beam,
+        times=message.time_increment * beam if message.time_increment > 0 else None,
+        stamp=stamp or 1e-9 * arrival,
+        frame_id=message.header.frame_id,
+    )

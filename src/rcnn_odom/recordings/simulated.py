@@ -18,8 +18,8 @@ from scipy.spatial import cKDTree
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, planar_to_poses
-from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.simulation.indoor.building import Building, plan_building
 from rcnn_odom.simulation.indoor.people import populate
 from rcnn_odom.simulation.indoor.robot import random_walk
@@ -29,8 +29,8 @@ from rcnn_odom.simulation.street.city import Plan, Roads, Warp, random_plan, ran
 from rcnn_odom.simulation.street.drive import Drive, at_other_paces, random_drive
 from rcnn_odom.simulation.street.speed import FRAME_TIME
 from rcnn_odom.simulation.street.street import build_streets
-from rcnn_odom.simulation.street.terrain import Ground, flat_ground, random_ground, stand
 from rcnn_odom.simulation.street.traffic import build_traffic
+from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground, stand
 
 VERSION = 4
 """Counts changes of the generator: part of every fingerprint."""
@@ -85,14 +85,14 @@ def load(
     missing: bool = True,
     tilt: bool = True,
     vary_pace: bool = True,
-) -> Sequence:
+) -> Recording:
     """A simulated drive: another world for every name and seed.
 
     Args:
         name: any name; the same name and seed always give the same drive. ``NAME~1``, ``NAME~2`` ... are
             other drives in other worlds, each as long as ``NAME``.
-        sensor: fields of :class:`rcnn_odom.models.encoding.Sensor`; the others are KITTI's, or indoors a
-            SICK's.
+        sensor: ``resolution_deg``, ``field_of_view_deg`` and ``max_range`` in metres; the others are
+            KITTI's, or indoors a SICK's.
         world: ``street`` or ``indoor``.
         scale: by which ``FRAMES`` says how long the drive of a name is.
         frames: its length whatever its name; None: by scale and name.
@@ -113,10 +113,10 @@ def load(
     other_paces = vary_pace and world == "street" and "~" in name
     recipe = _Recipe(name, seed, world, length, movers, tilt, other_paces)
     reader = ScanReader(recipe, _laser(name, world, sensor or {}), missing)
-    return Sequence(
+    return Recording(
         name=name,
         poses=_poses(recipe).copy(),
-        stamps=FRAME_TIME * np.arange(length, dtype=np.float64),
+        stamps=_stamps(recipe).copy(),
         read_scan=reader,
         fingerprint=hashlib.sha256(f"simulated {VERSION} {LIBRARIES} {asdict(reader)}".encode()).hexdigest(),
     )
@@ -137,15 +137,15 @@ def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> 
 
 
 def _laser(name: str, world: str, given: dict[str, Any]) -> Laser:
-    sensor = Sensor(**SENSORS[world] | given)
     if world == "indoor":
-        return scanner(sensor)
-    if sensor.max_range > LONGEST_RANGE:
+        return scanner(**SENSORS[world] | given)
+    max_range = given.get("max_range", LONGEST_RANGE)
+    if max_range > LONGEST_RANGE:
         raise InputError(
             f"simulated sequence {name}: the streets are drawn for lasers that see {LONGEST_RANGE:g} m; "
-            f"lower data.sensor.max_range, {sensor.max_range:g}"
+            f"lower data.sensor.max_range, {max_range:g}"
         )
-    return hdl64_ring(sensor.max_range)
+    return hdl64_ring(max_range)
 
 
 @dataclass(frozen=True)
@@ -186,13 +186,12 @@ class ScanReader:
         scene = _stretch(self.recipe, frame // STRETCH, self.laser.max_range)
         return self.laser.look(scene, frame, _poses(self.recipe)[frame], rng, self.missing)
 
-    def __call__(self, frame: int) -> tuple[FloatArray, FloatArray]:
-        """Angles in radians and horizontal ranges in metres, both (P,), of the beams that came back."""
-        x, y = self.points(frame)[:, :2].T.astype(np.float64)
-        return np.arctan2(y, x), np.hypot(x, y)
+    def __call__(self, frame: int) -> Scan:
+        """The beams that came back, their ranges horizontal."""
+        return Scan.from_points(self.points(frame), float(_stamps(self.recipe)[frame]))
 
 
-def roads_of(drive: Sequence) -> Roads:
+def roads_of(drive: Recording) -> Roads:
     """What kind of roads a street drive goes along."""
     assert isinstance(drive.read_scan, ScanReader)
     return _street(drive.read_scan.recipe).plan.roads
@@ -228,10 +227,10 @@ def _street(recipe: _Recipe) -> _Street:
 
 
 @lru_cache(maxsize=4)
-def _indoor(recipe: _Recipe) -> tuple[Building, FloatArray]:
-    """A building and where in it the laser goes, (N, 3)."""
+def _indoor(recipe: _Recipe) -> tuple[Building, FloatArray, FloatArray]:
+    """A building, where in it the laser goes, (N, 3), and when, (N,)."""
     building = plan_building(recipe.generator(_PLAN))
-    return building, random_walk(building, recipe.frames, recipe.generator(_DRIVE))
+    return building, *random_walk(building, recipe.frames, recipe.generator(_DRIVE))
 
 
 @lru_cache(maxsize=4)
@@ -240,6 +239,13 @@ def _poses(recipe: _Recipe) -> FloatArray:
     if recipe.world == "street":
         return _street(recipe).poses
     return planar_to_poses(_indoor(recipe)[1])
+
+
+def _stamps(recipe: _Recipe) -> FloatArray:
+    """Seconds, (N,): those of KITTI's laser, or of the robot's own."""
+    if recipe.world == "indoor":
+        return _indoor(recipe)[2]
+    return FRAME_TIME * np.arange(recipe.frames, dtype=np.float64)
 
 
 @lru_cache(maxsize=2)
@@ -264,7 +270,8 @@ def _places(recipe: _Recipe) -> tuple[cKDTree, float]:
 def _scene(recipe: _Recipe) -> Scene:
     standing, moving = recipe.generator(_STANDING), recipe.generator(_MOVING)
     if recipe.world == "indoor":
-        return populate(*_indoor(recipe), standing, recipe.movers)
+        building, planar, _ = _indoor(recipe)
+        return populate(building, planar, standing, recipe.movers)
     plan, warp, ground, drive, _ = _street(recipe)
     walls = build_streets(plan, warp, ground, drive.path, standing)
     if not recipe.movers:

@@ -6,7 +6,6 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.simulation.raycast import NO_WALL, cast
 from rcnn_odom.simulation.scene import Material, Scene
 
@@ -112,11 +111,6 @@ def hdl64_ring(max_range: float) -> Laser:
     )
 
 
-def scanner(sensor: Sensor) -> Laser:
-    """A robot's level laser with one beam for each bin, such as a SICK LMS."""
-    return Laser(
-        step_deg=sensor.resolution_deg,
-        field_of_view_deg=sensor.field_of_view_deg,
-        max_range=sensor.max_range,
-        noise=0.01,
-    )
+def scanner(resolution_deg: float, field_of_view_deg: float, max_range: float) -> Laser:
+    """A robot's level laser, such as a SICK LMS: degrees between its beams and in all, and metres."""
+    return Laser(resolution_deg, field_of_view_deg=field_of_view_deg, max_range=max_range, noise=0.01)

@@ -6,7 +6,7 @@ from numba import njit, vectorize
 
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Walls
-from rcnn_odom.simulation.street.terrain import Ground, height_at
+from rcnn_odom.simulation.terrain import Ground, height_at
 
 NO_WALL = -1
 HIT_GROUND = -2

@@ -7,7 +7,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.simulation.street.terrain import Ground
+from rcnn_odom.simulation.terrain import Ground
 
 
 @dataclass(frozen=True)

@@ -8,24 +8,26 @@ import sys
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
+import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 from tqdm import tqdm
 
-from rcnn_odom.deployment.odometer import Description, Odometer
+from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.onnx_model import OnnxStepper
-from rcnn_odom.evaluation.run_report import icp_stepping
 from rcnn_odom.evaluation.scores import aligned
-from rcnn_odom.geometry import FloatArray
-from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.models.icp import PointToLineICP
-from rcnn_odom.models.networks import RCNN
+from rcnn_odom.geometry import Step
+from rcnn_odom.models.cnn import CNNRegression
+from rcnn_odom.models.contract import Description, Stepper
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.icp import ICP
+from rcnn_odom.models.rcnn import RCNNRegression
+from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings import simulated
-from rcnn_odom.training.checkpoint_stepper import CheckpointStepper
-from rcnn_odom.training.modules import VARIANTS, OdometryModule
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training.onnx_graph import to_onnx
 
 ROUNDS = 8
@@ -35,15 +37,29 @@ FRAMES = 60
 HIDDEN = 1024
 """Width of the paper's LSTM."""
 SMALL = "rcnn_small"
+Trained = TypeVar("Trained", bound=TrainedModel)
 
-Step = Callable[[int], object]
+Compute = Callable[[int], object]
+"""What is measured: something for one frame."""
+OPTIONS = {
+    "kernel_size": 3,
+    "pooling": "avg",
+    "angle": "expectation",
+    "dropout": 0.0,
+    "rotation_classes": {"count": 112, "width_deg": 0.1},
+    "apply": "end",
+    "layers": 2,
+    "projection": None,
+    "freeze": False,
+}
+"""Of the paper's networks, beside their width."""
 
 
 @dataclass
 class Way:
     """A way of computing something for frame 1, 2 ... ``FRAMES`` - 1, and its times in milliseconds."""
 
-    step: Step
+    step: Compute
     timed: int = TIMED
     times: list[float] = field(default_factory=list)
     _next: int = 0
@@ -72,11 +88,11 @@ class Way:
 class Nothing:
     """A stepper without a network: what is left is the cost of everything around one."""
 
-    description = Description(Sensor(), "end", (1.0, 0.02), 0.0, 0.1)
+    description = Description(Sensor(), (1.0, 0.02, 0.02), 0.0, 0.1)
 
-    def __call__(self, pair: Any) -> tuple[FloatArray, FloatArray]:
+    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
         """Always the same."""
-        return np.ones(2), np.ones(2)
+        return Step(1.0, 0.0, 1.0)
 
     def reset(self) -> None:
         """There is nothing to forget."""
@@ -85,66 +101,57 @@ class Nothing:
 def main() -> int:
     """Measures and prints."""
     torch.set_num_threads(1)
-    scans = [simulated.load("05", scale="small", frames=FRAMES).read_scan(frame) for frame in range(FRAMES)]
-    module = build("rcnn_reg")
-    ways = build_ways(module, scans)
+    drive = simulated.load("05", scale="small", frames=FRAMES)
+    network = build(RCNNRegression)
+    ways = build_ways(network, [drive.read_scan(frame) for frame in range(FRAMES)])
     with torch.inference_mode():
         for _ in tqdm(range(ROUNDS), desc="rounds", disable=None, leave=False):
             for way in ways.values():
                 way.take_turn()
-    print(report(ways, module))
+    print(report(ways, network))
     return 0
 
 
-def build(variant: str, hidden: int | None = None) -> OdometryModule:
-    """An untrained module of the paper's size, or with another width of its LSTM."""
+def build(model: type[Trained], hidden: int | None = None) -> Trained:
+    """An untrained network of the paper's size, or with another width of its LSTM."""
     torch.manual_seed(0)
-    model = {
-        "kernel_size": 3,
-        "pooling": "avg",
-        "angle": "expectation",
-        "dropout": 0.0,
-        "rotation_classes": {"count": 112, "width_deg": 0.1},
-        "hidden_size": hidden or HIDDEN,
-        "layers": 2,
-        "projection": None,
-        "freeze": False,
-    }
-    return VARIANTS[variant](model, Sensor().as_dict(), {"lengths": [100.0], "apply": "end"}).eval()
+    return model(OPTIONS | {"hidden_size": hidden or HIDDEN}, Sensor()).eval()
 
 
-def build_ways(module: OdometryModule, scans: list[tuple[FloatArray, FloatArray]]) -> dict[str, Way]:
+def build_ways(network: RCNNRegression, scans: list[Scan]) -> dict[str, Way]:
     """Everything that is measured, by name; the longest take fewer frames."""
-    assert isinstance(module.network, RCNN)
-    weights = sum(parameter.numel() for parameter in module.network.lstm.parameters())
-    depths = np.stack([encode(*scan, Sensor()) for scan in scans])
-    graphs = {
-        "onnx fp32": to_onnx(module, "fp32"),
-        "onnx int8": to_onnx(module, "int8"),
-        "convolutions": to_onnx(build("cnn_reg"), "fp32"),
-    }
-    onnx = {name: OnnxStepper(graph.SerializeToString()) for name, graph in graphs.items()}
-    icp, _ = icp_stepping(PointToLineICP(Sensor()), depths)
+    weights = sum(parameter.numel() for parameter in network.lstm.parameters())
+    depths = np.stack([Sensor().encode(scan) for scan in scans])
+    icp = ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, Sensor()).stepper()
     return {
         "read fp32 weights": Way(read(torch.ones(weights))),
         "read int8 weights": Way(read(torch.ones(weights // 4))),
-        "convolutions": Way(lambda frame: onnx["convolutions"](depths[frame - 1 : frame + 1])),
-        "eager nn.LSTM": Way(eager(module.network, depths), timed=3),
-        "checkpoint": Way(stepping(Odometer(CheckpointStepper(module)), scans)),
-        "onnx fp32": Way(stepping(Odometer(onnx["onnx fp32"]), scans)),
-        "onnx int8": Way(stepping(Odometer(onnx["onnx int8"]), scans)),
+        "convolutions": Way(alone(onnx(build(CNNRegression), "fp32"), depths)),
+        "eager nn.LSTM": Way(eager(network, depths), timed=3),
+        "onnx fp32": Way(stepping(Odometer(onnx(network, "fp32")), scans)),
+        "onnx int8": Way(stepping(Odometer(onnx(network, "int8")), scans)),
         SMALL: Way(stepping(Odometer.from_onnx(SMALL), scans)),
         "around the network": Way(stepping(Odometer(Nothing()), scans)),
-        "icp": Way(icp),
+        "icp": Way(alone(icp, depths)),
     }
 
 
-def read(weights: Tensor) -> Step:
+def onnx(network: TrainedModel, precision: str) -> OnnxStepper:
+    """A network as it is exported."""
+    return OnnxStepper(to_onnx(network, precision).SerializeToString())
+
+
+def read(weights: Tensor) -> Compute:
     """Reads all of an array once; of what was never written the system would not even give the memory."""
     return lambda _: weights.sum()
 
 
-def eager(network: RCNN, depths: np.ndarray) -> Step:
+def alone(stepper: Stepper, depths: npt.NDArray[np.float32]) -> Compute:
+    """A stepper without an odometer around it."""
+    return lambda frame: stepper(depths[frame - 1 : frame + 1])
+
+
+def eager(network: RCNNRegression, depths: npt.NDArray[np.float32]) -> Compute:
     """The network as a training script would call it: convolutions, ``torch.nn.LSTM``, head."""
     lstm = nn.LSTM(network.lstm.weight_ih[0].shape[1], network.lstm.hidden, 2, batch_first=True)
     same = {name.replace(".", "_l"): value for name, value in network.lstm.state_dict().items()}
@@ -153,7 +160,7 @@ def eager(network: RCNN, depths: np.ndarray) -> Step:
 
     def step(frame: int) -> object:
         nonlocal state
-        features = network.cnn.encode(torch.from_numpy(depths[None, None, frame - 1 : frame + 1]))
+        features = network.cnn.encoder(torch.from_numpy(depths[None, None, frame - 1 : frame + 1]))
         first = network.cnn.head.standardise(network.cnn.head(features).motion)
         outputs, state = lstm(torch.cat([features, first], -1), state)
         return network.head(outputs)
@@ -161,13 +168,13 @@ def eager(network: RCNN, depths: np.ndarray) -> Step:
     return step
 
 
-def stepping(odometer: Odometer, scans: list[tuple[FloatArray, FloatArray]]) -> Step:
+def stepping(odometer: Odometer, scans: list[Scan]) -> Compute:
     """Whole steps of an odometer, from the returns of a scan to a pose."""
-    odometer.step(scans[0][1], angles=scans[0][0])
-    return lambda frame: odometer.step(scans[frame][1], angles=scans[frame][0])
+    odometer.step(scans[0])
+    return lambda frame: odometer.step(scans[frame])
 
 
-def report(ways: dict[str, Way], module: OdometryModule) -> str:
+def report(ways: dict[str, Way], network: RCNNRegression) -> str:
     """A table of times, and the ratios with what is aimed at."""
     rows = [["ms a scan, one thread", "median", "99th percentile"]]
     rows += [[name, f"{way.median:.2f}", f"{way.p99:.2f}"] for name, way in ways.items()]
@@ -178,16 +185,13 @@ def report(ways: dict[str, Way], module: OdometryModule) -> str:
         ["ratios of medians", "measured", "aim"],
         ["eager / onnx int8", f"{eager_time / time_of['onnx int8']:.1f}", ">= 33"],
         ["onnx int8 / its floor", f"{time_of['onnx int8'] / int8:.2f}", "<= 1.7"],
-        ["eager / checkpoint", f"{eager_time / time_of['checkpoint']:.1f}", ">= 10"],
-        ["checkpoint / fp32 floor", f"{time_of['checkpoint'] / fp32:.2f}", "<= 1.5"],
         ["onnx fp32 / fp32 floor", f"{time_of['onnx fp32'] / fp32:.2f}", "<= 1.35"],
         [f"eager / {SMALL}", f"{eager_time / time_of[SMALL]:.0f}", ""],
         [f"icp / {SMALL}", f"{time_of['icp'] / time_of[SMALL]:.1f}", ""],
         [f"{SMALL}, ms", f"{time_of[SMALL]:.2f}", "<= 1.5"],
         ["around the network, ms", f"{time_of['around the network']:.2f}", "<= 0.3"],
     ]
-    assert isinstance(module.network, RCNN)
-    megabytes = sum(parameter.nbytes for parameter in module.network.lstm.parameters()) / 1e6
+    megabytes = sum(parameter.nbytes for parameter in network.lstm.parameters()) / 1e6
     about = f"floor: {megabytes:.0f} MB of LSTM weights, in int8 a quarter, read once, and the convolutions"
     return "\n".join([aligned(rows), "", about, "", aligned(ratios)])
 

@@ -8,9 +8,18 @@ import torch
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.recordings.cache import EncodedSequence
-from rcnn_odom.training.modules import VARIANTS, OdometryModule
+from rcnn_odom.models.two_numbers import steps_of
+from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.training.modules import OdometryModule, module_for
 from rcnn_odom.training.saving import save_atomically
+
+OLD_PLACES = {
+    "network.": "model.",
+    "uncertainty.least_filled": "model.least_filled",
+    "uncertainty.period": "model.period",
+    "uncertainty.": "model.uncertainty.",
+}
+"""Where weights of version 0.1 have gone, by the beginning of their names; the first that fits counts."""
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
@@ -42,19 +51,21 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
     """The trained module of a checkpoint, on the CPU, in evaluation mode.
 
     Args:
-        path: a ``.ckpt`` file of a run.
-        variant: which of the four it must be; None for any.
+        path: a ``.ckpt`` file of a run, also of version 0.1.
+        variant: the model that it must be of; None for any.
         sensor: which it must have been trained for; None for any.
 
     Raises:
-        InputError: no such file, not a checkpoint of this project, of another variant or sensor.
+        InputError: no such file, not a checkpoint of this project, of another model or sensor.
     """
     saved = read_checkpoint(path)
     try:
-        settings, weights = saved["hyper_parameters"], saved["state_dict"]
+        if "scoring" in saved["hyper_parameters"]:
+            _upgrade(saved)
+        settings = saved["hyper_parameters"]
         found = settings["variant"]
-        module = VARIANTS[found](settings["model"], settings["sensor"], settings["scoring"])
-        module.load_state_dict(weights)
+        module = module_for(found)(settings["model"], settings["sensor"], settings["lengths"])
+        module.load_state_dict(saved["state_dict"])
     except Exception as error:  # whatever a stranger's file holds
         raise _refusal(path, error) from error
     if variant is not None and found != variant:
@@ -67,12 +78,35 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
     return module.eval()
 
 
-def calibrate(path: str | Path, sequences: list[EncodedSequence]) -> OdometryModule:
-    """Fits the uncertainty of a checkpoint's network on validation drives and keeps it in the checkpoint.
+def _upgrade(saved: dict[str, Any]) -> None:
+    """Brings a checkpoint of version 0.1 into today's form.
+
+    There a network knew two numbers only: ``apply`` stood beside the lengths of the validation drift, and
+    nothing was known of steps.
+    """
+    settings, old = saved["hyper_parameters"], saved["state_dict"]
+    scoring = settings.pop("scoring")
+    settings["model"] = {**settings["model"], "apply": scoring["apply"]}
+    settings["model"].pop("variant")
+    settings["lengths"] = scoring["lengths"]
+    weights = {}
+    for name, value in old.items():
+        before = next(beginning for beginning in OLD_PLACES if name.startswith(beginning))
+        weights[OLD_PLACES[before] + name.removeprefix(before)] = value
+    mean, deviation = (old[f"network.head.{name}"].double() for name in ("mean", "deviation"))
+    distance, turn = (mean.square() + deviation.square()).sqrt().tolist()
+    weights["mean_step"] = torch.from_numpy(steps_of(mean.numpy(), scoring["apply"])).float()
+    weights["model.typical_step"] = torch.tensor([distance, np.nan, turn])
+    weights["model.uncertainty.lateral"] = torch.tensor(np.nan)
+    saved["state_dict"] = weights
+
+
+def calibrate(path: Path, drives: list[Drive]) -> OdometryModule:
+    """Fits what a checkpoint's model knows of validation drives and keeps it in the checkpoint.
 
     Args:
         path: a ``.ckpt`` file of a run; it changes at once or not at all.
-        sequences: validation drives with their truth.
+        drives: validation drives with their truth.
 
     Returns:
         The module, as :func:`load_module` gives it.
@@ -80,15 +114,8 @@ def calibrate(path: str | Path, sequences: list[EncodedSequence]) -> OdometryMod
     Raises:
         InputError: as :func:`load_module`.
     """
-    module, path = load_module(path), Path(path)
-    estimates = [module.estimate(torch.from_numpy(np.array(sequence.scans))) for sequence in sequences]
-    module.uncertainty.fit(
-        np.concatenate([estimate.features for estimate in estimates]),
-        np.concatenate([estimate.motions for estimate in estimates]),
-        np.concatenate([sequence.motions for sequence in sequences]),
-        np.concatenate([(sequence.scans > 0).mean(1) for sequence in sequences]),
-        np.concatenate([np.diff(sequence.stamps) for sequence in sequences]),
-    )
+    module = load_module(path)
+    module.model.calibrate(drives)
     saved = read_checkpoint(path)
     saved["state_dict"] = module.state_dict()
     save_atomically(saved, path)

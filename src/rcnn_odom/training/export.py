@@ -1,24 +1,25 @@
-"""The steps of ``rcnn-odom export``: calibrate, convert, compare, score, write."""
+"""The steps of ``rcnn-odom export``: calibrate, convert, compare, score, write. A checkpoint is only read."""
 
 from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from tqdm import tqdm
 
-from rcnn_odom.deployment.odometer import Stepper
+from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.scores import Report, coverage, coverage_table, score_all, table
-from rcnn_odom.geometry import FloatArray
-from rcnn_odom.recordings.cache import EncodedSequence
-from rcnn_odom.training.checkpoint import calibrate, load_module
-from rcnn_odom.training.datamodule import parse_part
-from rcnn_odom.training.modules import OdometryModule
+from rcnn_odom.evaluation.metrics import Report
+from rcnn_odom.evaluation.run_folder import Settings, read_settings
+from rcnn_odom.evaluation.scores import coverage, coverage_table, score_all, table
+from rcnn_odom.geometry import Steps
+from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.trained import TrainedModel
+from rcnn_odom.recordings.parts import parse_part
+from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.training.checkpoint import load_module
 from rcnn_odom.training.onnx_graph import check, to_onnx, write, write_metadata
-from rcnn_odom.training.run_state import read_settings
 from rcnn_odom.training.stages import build_datamodule
 
 if TYPE_CHECKING:
@@ -39,39 +40,35 @@ def export_checkpoint(
         out: the file to write.
         precision: ``fp32`` or ``int8``.
         fit_on: drives to fit the uncertainty on anew. None: as it is; where it has not been fitted yet, as
-            in a training that was stopped, on the validation sequences.
+            in a training that was stopped, on the validation sequences. The checkpoint keeps its own.
 
     Raises:
         InputError: no such checkpoint, no configuration of a run, recordings that are not to be had, drives
             to fit on that were trained or are tested on, a graph that does not do what the checkpoint
             does or costs too much drift.
     """
-    module, settings = load_module(checkpoint), read_settings(run)
+    model, settings = load_module(checkpoint).model, read_settings(run)
     data = settings["data"]
     if fit_on:
-        seen = sorted(
-            {parse_part(name)[0] for name in data["train"] + data["test"]}
-            & {parse_part(name)[0] for name in fit_on}
-        )
-        if seen:
-            raise InputError(f"--fit-on: {', '.join(seen)} was trained or is tested on; name other drives")
+        _need_unseen(fit_on, data)
         data["val"] = fit_on
-    fit = bool(fit_on) or not module.uncertainty.fitted
+    fit = bool(fit_on) or not model.calibrated
     datamodule = build_datamodule(settings).load(("val", "test") if fit else ("test",))
     if fit:
-        module = calibrate(checkpoint, datamodule.sequences["val"])
-    sequences = datamodule.sequences["test"]
-    steppers, models = _convert(module, dict.fromkeys(("fp32", precision)))
-    reports = _score(module, steppers, sequences, data)
+        model.calibrate(datamodule.drives["val"])
+    drives = datamodule.drives["test"]
+    steppers, graphs = _convert(model, dict.fromkeys(("fp32", precision)))
+    offline = {drive.name: model.estimate(drive) for drive in drives}
+    reports = _score(offline, steppers, drives, data)
     print(table(reports), flush=True)
-    if module.uncertainty.fitted:
-        print(f"\n{coverage_table(_cover(module, sequences))}\n", flush=True)
+    covered = {drive.name: coverage(offline[drive.name], drive.steps) for drive in drives}
+    known = {name: report for name, report in covered.items() if report is not None}
+    if known:
+        print(f"\n{coverage_table(known)}\n", flush=True)
     _need_little_cost(reports, precision)
-    write_metadata(
-        models[precision],
-        steppers[precision].metadata | {"drift": _summary(reports[f"onnx {precision}"], data)},
-    )
-    _write(models[precision], out, checkpoint)
+    summary = _summary(reports[f"onnx {precision}"], data)
+    write_metadata(graphs[precision], steppers[precision].metadata | {"drift": summary})
+    _write(graphs[precision], out, checkpoint)
 
 
 def export_unscored(checkpoint: Path, out: Path, precision: str) -> None:
@@ -80,55 +77,65 @@ def export_unscored(checkpoint: Path, out: Path, precision: str) -> None:
     Raises:
         InputError: no such checkpoint, or a graph that does not do what it does.
     """
-    _, models = _convert(load_module(checkpoint), [precision])
-    _write(models[precision], out, checkpoint)
+    _, graphs = _convert(load_module(checkpoint).model, [precision])
+    _write(graphs[precision], out, checkpoint)
+
+
+def load_odometer(checkpoint: str | Path, threads: int = 1) -> Odometer:
+    """A checkpoint's network for a stream, exported in memory.
+
+    Raises:
+        InputError: no such checkpoint.
+    """
+    graph = to_onnx(load_module(checkpoint).model, "fp32")
+    return Odometer(OnnxStepper(graph.SerializeToString(), threads))
+
+
+def _need_unseen(names: list[str], data: Settings) -> None:
+    """Compares whole recordings: a training on NAME also sees its new worlds, ``NAME~1`` and so on."""
+    used, wanted = (
+        {parse_part(name)[0].split("~")[0] for name in each} for each in (data["train"] + data["test"], names)
+    )
+    if seen := sorted(used & wanted):
+        raise InputError(f"--fit-on: {', '.join(seen)} was trained or is tested on; name other drives")
 
 
 def _convert(
-    module: OdometryModule, precisions: Iterable[str]
+    model: TrainedModel, precisions: Iterable[str]
 ) -> tuple[dict[str, OnnxStepper], dict[str, "onnx.ModelProto"]]:
-    """Graphs, compared with their module, by precision; ready to step, and to be written."""
-    models = {precision: to_onnx(module, precision) for precision in precisions}
-    steppers = {each: OnnxStepper(model.SerializeToString()) for each, model in models.items()}
+    """Graphs, compared with their model, by precision; ready to step, and to be written."""
+    graphs = {precision: to_onnx(model, precision) for precision in precisions}
+    steppers = {each: OnnxStepper(graph.SerializeToString()) for each, graph in graphs.items()}
     for stepper in steppers.values():
-        check(stepper, module)
-    return steppers, models
+        check(stepper, model)
+    return steppers, graphs
 
 
-def _write(model: "onnx.ModelProto", out: Path, checkpoint: Path) -> None:
-    write(model, out)
+def _write(graph: "onnx.ModelProto", out: Path, checkpoint: Path) -> None:
+    write(graph, out)
     size = out.stat().st_size / 1e6
     print(f"{out}: {size:.1f} MB, its steps compared with those of {checkpoint}")
 
 
-def _cover(module: OdometryModule, sequences: list[EncodedSequence]) -> dict[str, Report]:
-    """How often the truth lies within the deviations, by sequence."""
-    drives = {s.name: (module.estimate(torch.from_numpy(np.array(s.scans))), s.motions) for s in sequences}
-    return {name: coverage(e.motions, truth, e.deviations) for name, (e, truth) in drives.items()}
-
-
 def _score(
-    module: OdometryModule,
-    steppers: dict[str, OnnxStepper],
-    sequences: list[EncodedSequence],
-    data: dict,
+    offline: dict[str, Steps], steppers: dict[str, OnnxStepper], drives: list[Drive], data: Settings
 ) -> dict[str, Report]:
     """Scores of the checkpoint and of each precision, see :func:`rcnn_odom.evaluation.scores.score_all`."""
-    offline = {s.name: module.estimate(torch.from_numpy(np.array(s.scans))).motions for s in sequences}
     estimates = {"checkpoint": offline}
     for precision, stepper in steppers.items():
-        estimates[f"onnx {precision}"] = {s.name: stream_motions(stepper, s) for s in sequences}
+        estimates[f"onnx {precision}"] = {drive.name: stream_steps(stepper, drive) for drive in drives}
     return {
-        method: score_all(sequences, motions, data["lengths"], data["apply"])
-        for method, motions in estimates.items()
+        method: score_all(drives, steps, data["lengths"], data["apply"])
+        for method, steps in estimates.items()
     }
 
 
-def stream_motions(stepper: Stepper, sequence: EncodedSequence) -> FloatArray:
-    """Motions (N-1, 2) of a drive, one pair of scans after the other."""
+def stream_steps(stepper: Stepper, drive: Drive) -> Steps:
+    """The steps of a drive, one pair of scans after the other."""
     stepper.reset()
-    frames = tqdm(range(len(sequence) - 1), desc=sequence.name, unit="scan", disable=None, leave=False)
-    return np.stack([stepper(np.array(sequence.scans[frame : frame + 2]))[0] for frame in frames])
+    frames = tqdm(range(len(drive) - 1), desc=drive.name, unit="scan", disable=None, leave=False)
+    steps = [stepper(np.array(drive.scans[frame : frame + 2])) for frame in frames]
+    return Steps(np.stack([step.array() for step in steps]), np.stack([step.covariance for step in steps]))
 
 
 def _need_little_cost(reports: dict[str, Report], precision: str) -> None:
@@ -143,7 +150,7 @@ def _need_little_cost(reports: dict[str, Report], precision: str) -> None:
         )
 
 
-def _summary(report: Report, data: dict) -> Report:
+def _summary(report: Report, data: Settings) -> Report:
     """What the file tells of its drift, as ratios."""
     by_sequence = {name: one["drift"]["t_err"] for name, one in report["sequences"].items()}
     return {"data": data["name"], "mean": report["drift"], "sequences": by_sequence}

@@ -1,4 +1,4 @@
-"""Worlds without end: every epoch after the first trains on drives that nobody has seen before."""
+"""Every epoch after the first trains on new simulated drives, made beside training."""
 
 import logging
 import shutil
@@ -8,20 +8,14 @@ from pathlib import Path
 from threading import Event
 
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.recordings.cache import (
-    Encoded,
-    EncodedSequence,
-    Encoding,
-    OpenDrive,
-    cache_path,
-    encode_sequences,
-)
+from rcnn_odom.recordings.cache import Encoded, Encoding, cache_path, encode_recordings
+from rcnn_odom.recordings.recording import Drive, OpenRecording
 from rcnn_odom.recordings.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
 
 NICENESS = 10
-"""Training comes first: what it leaves of the processor makes worlds."""
+"""Of the processes that make worlds, so that training comes first."""
 POLLING = 0.2
 """Seconds between looks for the worlds that another process makes."""
 
@@ -34,7 +28,7 @@ class FreshWorlds:
     run goes on. They are maps of files, so memory does not grow with them.
 
     Args:
-        read: name -> ``Sequence``, picklable; a generator that takes any name.
+        open_recording: picklable; a generator that takes any name.
         drives: the training set.
         epochs: of this stage's training.
         sensor: theirs.
@@ -46,8 +40,8 @@ class FreshWorlds:
 
     def __init__(
         self,
-        read: OpenDrive,
-        drives: list[EncodedSequence],
+        open_recording: OpenRecording,
+        drives: list[Drive],
         epochs: int,
         sensor: Sensor,
         workers: int,
@@ -55,7 +49,8 @@ class FreshWorlds:
         keep: bool = False,
         first: int = 0,
     ) -> None:
-        self.read, self.drives, self.epochs, self.sensor, self.first = read, drives, epochs, sensor, first
+        self.open_recording, self.drives, self.epochs = open_recording, drives, epochs
+        self.sensor, self.first = sensor, first
         self.folder, self.keep = folder, keep
         self.worker_count = useful_workers(workers, sum(map(len, drives)))
         self.waited = 0.0
@@ -63,10 +58,10 @@ class FreshWorlds:
         self._workers: Workers[Encoded] | None = None
         # One thread: the workers make one epoch after the other.
         self._maker = ThreadPoolExecutor(1)
-        self._made: dict[int, Future[list[EncodedSequence]]] = {}
+        self._made: dict[int, Future[list[Drive]]] = {}
         self._closed = Event()
 
-    def of(self, epoch: int) -> list[EncodedSequence]:
+    def drives_of(self, epoch: int) -> list[Drive]:
         """The drives of an epoch, waiting for them if need be; those of the next are begun.
 
         Raises:
@@ -75,7 +70,7 @@ class FreshWorlds:
         wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
         if wanted and self._workers is None and self.worker_count and not self._has_all(wanted):
             log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
-            self._workers = Workers(self.worker_count, Encoding(self.read, self.sensor), NICENESS)
+            self._workers = Workers(self.worker_count, Encoding(self.open_recording, self.sensor), NICENESS)
         for gone in set(self._made) - set(wanted):
             self._forget(self._made.pop(gone))
         for e in wanted:
@@ -90,18 +85,18 @@ class FreshWorlds:
         return [f"{drive.name}~{self.first + epoch}" for drive in self.drives]
 
     def _has_all(self, epochs: list[int]) -> bool:
-        worlds = (self.read(name) for epoch in epochs for name in self._names(epoch))
+        worlds = (self.open_recording(name) for epoch in epochs for name in self._names(epoch))
         return all(cache_path(world, self.sensor, self.folder).exists() for world in worlds)
 
-    def _make(self, epoch: int) -> list[EncodedSequence]:
-        worlds = [self.read(name) for name in self._names(epoch)]
+    def _make(self, epoch: int) -> list[Drive]:
+        worlds = [self.open_recording(name) for name in self._names(epoch)]
         paths = [cache_path(world, self.sensor, self.folder) for world in worlds]
         while not (self.worker_count or all(path.exists() for path in paths)):
             if self._closed.wait(POLLING):
                 return []
-        return encode_sequences(worlds, self.sensor, self.folder, max(1, self.worker_count), self._workers)
+        return encode_recordings(worlds, self.sensor, self.folder, max(1, self.worker_count), self._workers)
 
-    def _forget(self, made: "Future[list[EncodedSequence]]") -> None:
+    def _forget(self, made: "Future[list[Drive]]") -> None:
         """Lets go of the worlds of an epoch. What still maps their files can go on reading."""
         if not self.keep and self.worker_count and made.done() and not made.exception():
             for drive in made.result():

@@ -17,18 +17,40 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.training import (
-    run_folder,  # noqa: F401  resolvers of conf/config.yaml
-    sweep,  # noqa: F401  resolvers of conf/config.yaml
-)
+from rcnn_odom.evaluation.run_folder import ERROR
+from rcnn_odom.training import defaults  # noqa: F401  the resolver of conf/model
+from rcnn_odom.training.run_state import find_stopped
+from rcnn_odom.training.settings import RENAMED, plain
+from rcnn_odom.training.sweep import folder_name
 
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
-ERROR = "error.txt"
-"""In the folder of a sweep's job that failed: why, in one line."""
+
+NO_JOB_SUCCEEDED = "No trials are completed yet."
+"""What Optuna says at the end of a sweep whose jobs have all failed."""
 
 _failed: list[Exception] = []
+
+
+def run_folder(new: str, *, _root_: DictConfig) -> str:
+    """The folder of a run that was stopped and has the very same settings, else a new one.
+
+    Args:
+        new: the folder for a new run; older ones are looked for beside it.
+        _root_: the whole configuration, which OmegaConf gives.
+    """
+    chosen = [str(key) for key in _root_ if key not in ("hydra", "run_dir")]
+    try:
+        settings = plain(OmegaConf.masked_copy(_root_, chosen))
+    except (InputError, OmegaConfBaseException):  # will be logged when the run begins
+        return new
+    return str(find_stopped(Path(new).parent, settings) or new)
+
+
+# For conf/config.yaml.
+OmegaConf.register_new_resolver("run_folder", run_folder, replace=True)
+OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
 def in_sweep() -> bool:
@@ -96,15 +118,17 @@ def run_command(main: Callable[[], object]) -> int:
     except InputError:  # of a sweep's job, which has told
         return 1
     except ValueError as error:
-        if not _failed:
+        if not _failed or str(error) != NO_JOB_SUCCEEDED:
             raise
-        # A sweeper that had no job to learn from; why they failed has been told.
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {error}", file=sys.stderr)  # why each job failed is already logged
         return 1
     except (HydraException, OmegaConfBaseException, OSError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.
         message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
         hint = "; choose another outputs= or run_dir=" if isinstance(error, OSError) else ""
+        for before, now in RENAMED.items():
+            if f"'{before}" in message:
+                message = f"{before} has become {now}; set that"
         print(f"error: {' '.join(message.split())}{hint}", file=sys.stderr)
         return 1
     return 1 if _failed else 0

@@ -1,4 +1,4 @@
-"""Settings that make the best of the machine, each falling back by itself where it does not apply."""
+"""Hardware-dependent settings with automatic fallbacks."""
 
 import ctypes
 import sys

@@ -1,7 +1,10 @@
-"""The four variants of the paper as LightningModules."""
+"""Models as LightningModules: one class trains any model, the four of the paper have names of their own."""
 
+import pickle
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, cast
 
 import lightning as L
 import numpy as np
@@ -10,90 +13,53 @@ from torch import Tensor
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift_metric import DriftMetric
-from rcnn_odom.evaluation.scores import camera_trajectory, frame_errors
-from rcnn_odom.geometry import FloatArray
+from rcnn_odom.evaluation.metrics import DRIFT, all_metrics
+from rcnn_odom.evaluation.run_folder import Settings
+from rcnn_odom.geometry import FloatArray, Steps, change_frame
+from rcnn_odom.models.contract import find_model
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.losses import classification_loss, regression_loss
-from rcnn_odom.models.networks import CNN, RCNN, RotationClasses
-from rcnn_odom.models.uncertainty import Uncertainty
-from rcnn_odom.training.datamodule import Batch, OdometryDataModule
+from rcnn_odom.models.trained import Batch, TrainedModel
+from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import keep_freed_memory
-from rcnn_odom.training.settings import Settings
-
-EVALUATION_CHUNK = 64
-"""Pairs that go through the convolutions together when a whole drive is estimated."""
-
-
-class DriveEstimate(NamedTuple):
-    """A network's estimate of one whole drive.
-
-    Attributes:
-        motions: (N-1, 2) metres and radians.
-        deviations: their standard deviations, (N-1, 2); nan while the uncertainty is not fitted.
-        features: (N-1, K) of :class:`rcnn_odom.models.uncertainty.Uncertainty`.
-    """
-
-    motions: FloatArray
-    deviations: FloatArray
-    features: FloatArray
 
 
 class OdometryModule(L.LightningModule):
-    """What the variants share: training step, drives estimated in order, optimiser, logging.
+    """Trains any model: training step, drives estimated in order, optimiser, logging.
 
     Args:
-        model: the options of ``conf/model``, plain.
+        variant: name of a model that trains.
+        options: those of ``conf/model``, plain.
         sensor: of :class:`rcnn_odom.models.encoding.Sensor`, plain.
-        scoring: ``lengths`` (metres) and ``apply`` for the validation drift, plain.
+        lengths: in metres, of the segments of the validation drift.
+
+    Attributes:
+        model: the model.
+        mean_step: (3,) of the training drives, metres and radians, for the baseline ``mean_motion``.
+        estimates: the steps of the drives that were validated or tested last, by the drives' names.
+        estimates_file: where a test in other processes leaves its estimates.
+        fingerprint, code: of the training, for its checkpoints: see
+            :class:`rcnn_odom.training.run_state.Fingerprints`.
     """
 
-    variant: ClassVar[str]
-    recurrent: ClassVar[bool]
-    classifies: ClassVar[bool]
-    network: CNN | RCNN
+    variant: str
+    mean_step: Tensor
 
-    def __init__(self, model: Settings, sensor: Settings, scoring: Settings) -> None:
+    def __init__(self, variant: str, options: Settings, sensor: Settings, lengths: list[float]) -> None:
         super().__init__()
         self.save_hyperparameters(
-            {"variant": self.variant, "model": model, "sensor": sensor, "scoring": scoring}
+            {"variant": variant, "model": options, "sensor": sensor, "lengths": lengths}
         )
-        self.model, self.scoring = model, scoring
-        self.sensor = Sensor(**sensor)
-        self.classes = RotationClasses(**model["rotation_classes"])
-        self.network = self._build()
-        self.uncertainty = Uncertainty(self.recurrent)
-        self.estimates: dict[int, DriveEstimate] = {}
+        self.variant, self.lengths = variant, lengths
+        self.model = cast(TrainedModel, find_model(variant)(options, Sensor(**sensor)))
+        self.register_buffer("mean_step", torch.full((3,), torch.nan))
+        self.estimates: dict[str, Steps] = {}
         self.estimates_file: Path | None = None
-        """Where a test in other processes leaves its estimates."""
-        self.fingerprint = ""
-        """Of the training, for its checkpoints: see :func:`rcnn_odom.training.run_state.fingerprint`."""
+        self.fingerprint = self.code = ""
 
-    def _build(self) -> CNN | RCNN:
-        model = self.model
-        cnn_classes = self.classes if self.classifies or self.recurrent else None
-        angle, dropout = model["angle"], model["dropout"]
-        cnn = CNN(
-            self.sensor.bins,
-            self.sensor.max_range,
-            cnn_classes,
-            model["kernel_size"],
-            model["pooling"],
-            angle,
-            0.0 if self.recurrent else dropout,
-        )
-        if not self.recurrent:
-            return cnn
-        cnn.requires_grad_(not model["freeze"])
-        head_classes = self.classes if self.classifies else None
-        sizes = model["hidden_size"], model["layers"]
-        return RCNN(cnn, head_classes, *sizes, angle, dropout, model["projection"])
-
-    def set_motion_statistics(self, mean: FloatArray, deviation: FloatArray) -> None:
-        """Mean and deviation (2,), (2,) of the training motions, the heads' units."""
-        heads = [self.network.head] + ([self.network.cnn.head] if isinstance(self.network, RCNN) else [])
-        for head in heads:
-            head.mean.copy_(torch.from_numpy(mean))
-            head.deviation.copy_(torch.from_numpy(deviation))
+    def set_units(self, steps: FloatArray) -> None:
+        """Told the training drives' steps (N, 3) before training, in metres and radians."""
+        self.mean_step.copy_(torch.from_numpy(steps.mean(0)))
+        self.model.set_units(steps)
 
     def setup(self, stage: str) -> None:
         """Lightning's hook, in every process that trains or tests."""
@@ -114,30 +80,19 @@ class OdometryModule(L.LightningModule):
         torch.manual_seed(int(np.random.SeedSequence(drawn_from).generate_state(1)[0]))
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """The loss of one batch of windows and its parts, scalars.
+        """The loss of one batch of windows and what the model logs beside it, scalars.
 
         Raises:
             InputError: the loss is nan or inf.
         """
-        truth = batch["motions"]
-        estimate, _ = self.network(batch["pairs"])
-        beta, per_sample = self.model["beta"], self.model["per_sample_norm"]
-        outside = {}
-        if estimate.scores is None:
-            loss = regression_loss(estimate.motion, truth, beta, per_sample)
-        else:
-            classes = self.classes.index(truth[..., 1])
-            loss = classification_loss(estimate.motion, estimate.scores, truth, classes, beta, per_sample)
-            share = self.classes.outside(truth[..., 1]) / truth[..., 1].numel()
-            outside = {"headings_outside_classes": share}
+        outputs = self.model.loss(batch)
+        to_blame = outputs.pop("diverged", None)
         self._trained_on = batch["frames"]
-        if not loss.total.isfinite():
-            finite = estimate.motion.isfinite().all(-1).all(-1)
-            # One bad window spoils the mean of all: the estimates tell which it is.
-            self._trained_on = batch["frames"] if finite.all() else batch["frames"][~finite]
+        if not outputs["loss"].isfinite():
+            if to_blame is not None and to_blame.any():
+                self._trained_on = batch["frames"][to_blame]
             raise self._diverged("the loss is nan or inf", self.global_step + 1)
-        parts = {"loss_distance": loss.distance, "loss_rotation": loss.rotation}
-        return {"loss": loss.total, **parts, **outside}
+        return outputs
 
     def configure_gradient_clipping(
         self,
@@ -178,106 +133,74 @@ class OdometryModule(L.LightningModule):
     def _data(self) -> OdometryDataModule:
         return self.trainer.datamodule  # type: ignore[attr-defined,no-any-return]
 
-    @torch.no_grad()
-    def estimate(self, scans: Tensor) -> DriveEstimate:
-        """The motions of one whole drive (N, bins) in metres, the LSTM state carried throughout.
-
-        In full precision whatever the training's, so that a checkpoint gives the same numbers everywhere.
-        """
-        state, motions, features = None, [], []
-        with torch.autocast(scans.device.type, enabled=False):
-            for start in range(0, len(scans) - 1, EVALUATION_CHUNK):
-                block = scans[start : start + EVALUATION_CHUNK + 1]
-                pairs = torch.stack([block[:-1], block[1:]], dim=1)
-                estimate, state = self.network(pairs[None], state)
-                motions.append(estimate.motion[0].double().cpu().numpy())
-                difficulty = self.uncertainty.features(estimate, self.network.head)
-                features.append(difficulty[0].double().cpu().numpy())
-        weights = self.uncertainty.weights.double().cpu().numpy()
-        difficulties = np.concatenate(features)
-        return DriveEstimate(np.concatenate(motions), difficulties @ weights.T, difficulties)
-
     def on_validation_epoch_start(self) -> None:
         """Forgets the estimates of the epoch before."""
         self.estimates = {}
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Keeps the estimate of one whole sequence.
+        """Keeps the estimate of one whole drive.
 
         Raises:
             InputError: training has diverged.
         """
-        estimate = self.estimate(batch["scans"])
-        if not np.isfinite(estimate.motions).all():
+        steps = self.model.estimate_scans(batch["scans"])
+        if not np.isfinite(steps.values).all():
             raise self._diverged("validation is estimated as nan or inf", self.global_step)
-        self.estimates[batch["number"]] = estimate
+        self.estimates[batch["name"]] = steps
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the drift of each validation sequence and their mean, and the mean errors of a frame.
+        """Logs the drift of each validation drive and their mean, and the other metrics of a training.
 
         Raises:
             InputError: a weight is nan or inf, behind a ReLU that hides it; it must not become the best.
         """
         self.check_weights()
         self._gather_estimates()
-        sequences = self._data.sequences["val"]
-        names = [sequence.name for sequence in sequences]
-        drift = DriftMetric(names, lengths=self.scoring["lengths"], planar=True)
-        errors, frames = [], []
-        for number, estimate in sorted(self.estimates.items()):
-            sequence = sequences[number]
-            poses = camera_trajectory(sequence, estimate.motions, self.scoring["apply"])
-            drift.update(sequence.camera_poses, poses, sequence.name)
-            errors.append(frame_errors(estimate.motions, sequence.motions))
-            frames.append(len(estimate.motions))
-        for name, value in drift.compute().items():
-            self.log(f"val/{name}", value)
-        for name in ("distance_mae_m", "heading_mae_deg"):
-            self.log(f"val/{name}", float(np.average([error[name] for error in errors], weights=frames)))
+        drives = [drive for drive in self._data.drives["val"] if drive.name in self.estimates]
+        drift = DriftMetric([drive.name for drive in drives], lengths=self.lengths, planar=True)
+        for drive in drives:
+            poses = change_frame(self.estimates[drive.name].poses(), drive.camera_from_laser)
+            drift.update(drive.camera_poses, poses, drive.name)
+        values: dict[str, Any] = dict(drift.compute())
+        frames = [len(self.estimates[drive.name]) for drive in drives]
+        for metric in all_metrics().values():
+            if metric.in_training and metric.name != DRIFT.name:
+                each = [metric.compute(drive, self.estimates[drive.name], self.lengths) for drive in drives]
+                values[metric.name] = metric.over(each, frames)
+        self.log_dict({f"val/{name}": value for name, value in values.items() if value is not None})
 
     def on_test_epoch_start(self) -> None:
         """Forgets the estimates of an earlier test."""
         self.estimates = {}
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Keeps the estimate of one whole sequence; ``rcnn_odom.evaluation.scores`` scores it."""
-        self.estimates[batch["number"]] = self.estimate(batch["scans"])
+        """Keeps the estimate of one whole drive; ``rcnn_odom.evaluation.scores`` scores it."""
+        self.estimates[batch["name"]] = self.model.estimate_scans(batch["scans"])
 
     def on_test_epoch_end(self) -> None:
         """Every process gets the estimates of all, and one leaves them in ``estimates_file``."""
         self._gather_estimates()
         if self.estimates_file and self.global_rank == 0:
-            arrays = {
-                f"{number}/{name}": array
-                for number, drive in self.estimates.items()
-                for name, array in drive._asdict().items()
-            }
-            np.savez(self.estimates_file, **arrays)
-
-    def load_estimates(self) -> None:
-        """Takes what a test in other processes has left in ``estimates_file``."""
-        assert self.estimates_file is not None
-        with np.load(self.estimates_file) as arrays:
-            numbers = {name.split("/")[0] for name in arrays}
-            self.estimates = {
-                int(number): DriveEstimate(*(arrays[f"{number}/{name}"] for name in DriveEstimate._fields))
-                for number in numbers
-            }
+            self.estimates_file.write_bytes(pickle.dumps(self.estimates))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
         """Signs the checkpoint."""
-        checkpoint["fingerprint"] = self.fingerprint
+        checkpoint |= {"fingerprint": self.fingerprint, "code": self.code}
 
     def _gather_estimates(self) -> None:
-        """Shares estimates among processes; a sequence that two of them have counts once."""
+        """Shares estimates among processes; a drive that two of them have counts once."""
         if self.trainer.world_size > 1:
             shares: list[Any] = [None] * self.trainer.world_size
             torch.distributed.all_gather_object(shares, self.estimates)
-            self.estimates = {number: drive for share in shares for number, drive in share.items()}
+            self.estimates = {name: steps for share in shares for name, steps in share.items()}
 
     def configure_optimizers(self) -> Any:
-        """Adam with a one-cycle rate over the whole training."""
-        rate = self.model["learning_rate"]
+        """Adam with a one-cycle rate over the whole training.
+
+        The one-cycle schedule also lets Adam's beta1 fall from 0.95 to 0.85 while the rate rises, and rise
+        again while it falls: ``cycle_momentum``, on by default in PyTorch.
+        """
+        rate = self.model.options["learning_rate"]
         optimizer = torch.optim.Adam([p for p in self.parameters() if p.requires_grad], lr=rate, fused=True)
         # Not the trainer's own count, which makes the loader before a checkpoint can tell it where to go on.
         assert self.trainer.max_epochs is not None
@@ -286,42 +209,38 @@ class OdometryModule(L.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
-class CNNRegression(OdometryModule):
+class PaperModule(OdometryModule):
+    """A module that knows which model it trains."""
+
+    def __init__(self, options: Settings, sensor: Settings, lengths: list[float]) -> None:
+        super().__init__(self.variant, options, sensor, lengths)
+
+
+class CNNRegression(PaperModule):
     """Both outputs by eq. 3 from one pair of scans."""
 
-    variant, recurrent, classifies = "cnn_reg", False, False
+    variant = "cnn_reg"
 
 
-class CNNClassification(OdometryModule):
+class CNNClassification(PaperModule):
     """Rotation by eq. 4 from one pair of scans: the first stage of both recurrent variants."""
 
-    variant, recurrent, classifies = "cnn_cls", False, True
+    variant = "cnn_cls"
 
 
-class RecurrentModule(OdometryModule):
-    """A first stage, then an LSTM."""
-
-    recurrent = True
-
-    def load_first_stage(self, cnn: CNNClassification) -> None:
-        """Takes the weights of a trained CNN."""
-        assert isinstance(self.network, RCNN)
-        self.network.cnn.load_state_dict(cnn.network.state_dict())
-
-
-class RCNNRegression(RecurrentModule):
+class RCNNRegression(PaperModule):
     """Eq. 3 after the LSTM: the paper's best."""
 
-    variant, classifies = "rcnn_reg", False
+    variant = "rcnn_reg"
 
 
-class RCNNClassification(RecurrentModule):
+class RCNNClassification(PaperModule):
     """Eq. 4 after the LSTM."""
 
-    variant, classifies = "rcnn_cls", True
+    variant = "rcnn_cls"
 
 
-VARIANTS: dict[str, type[OdometryModule]] = {
-    module.variant: module
-    for module in (CNNRegression, CNNClassification, RCNNRegression, RCNNClassification)
-}
+def module_for(variant: str) -> Callable[[Settings, Settings, list[float]], OdometryModule]:
+    """What makes the module of a model out of options, sensor and lengths, as :class:`OdometryModule`."""
+    named = {module.variant: module for module in PaperModule.__subclasses__()}
+    return named.get(variant) or partial(OdometryModule, variant)

@@ -1,11 +1,11 @@
-"""A trained network as an ONNX file: one pair of scans in, one motion out, the LSTM's state explicit."""
+"""A trained model as an ONNX file: one pair of scans in, one step out, the network's state explicit."""
 
 import json
 import logging
 import os
 import warnings
 from collections.abc import Iterator
-from contextlib import contextmanager, redirect_stdout, suppress
+from contextlib import contextmanager, redirect_stdout
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -15,12 +15,12 @@ import torch
 from torch import Tensor, nn
 
 from rcnn_odom import __version__
-from rcnn_odom.deployment.onnx_model import METADATA, OnnxStepper
+from rcnn_odom.deployment.onnx_model import FORMAT, METADATA, OnnxStepper
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import STEP_FRACTION
-from rcnn_odom.models.networks import RCNN
-from rcnn_odom.training.checkpoint_stepper import CheckpointStepper, describe
-from rcnn_odom.training.modules import OdometryModule
+from rcnn_odom.files import write_atomically
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.trained import TorchStepper, TrainedModel
 
 if TYPE_CHECKING:
     import onnx
@@ -32,19 +32,19 @@ BLOCK = 128
 CHECKED_STEPS = 20
 """Streamed steps that are compared: states that are mixed up agree on the first one."""
 TOLERANCE = {"fp32": 1e-4, "int8": 0.05}
-"""Largest difference from the checkpoint, in standard deviations of the training motions. That of int8 is
-there to notice broken files; what int8 costs is told by the drift."""
+"""Largest difference from the checkpoint, where a typical step of the training and a typical turn are 1. That
+of int8 is there to notice broken files; what int8 costs is told by the drift."""
 
-ABOUT = """Odometry from a 2D laser: the motion between two consecutive scans.
+ABOUT = """Odometry from a 2D laser: the step between two consecutive scans.
 Inputs: scans (1, 2, {bins}) float32, the depth vectors of the earlier and the later scan in metres{state_in}.
-Outputs: motion (1, 2), the distance in metres (negative: backwards) and the counter-clockwise change of
-heading in radians from the earlier to the later scan; deviation (1, 2), their standard deviations, nan where
-unknown{state_out}.
+Outputs: step (1, 3), where the later scan was taken, in the frame of the earlier one: x ahead and y to the
+left in metres and the counter-clockwise change of heading in radians; covariance (1, 3, 3), that of step, nan
+where unknown{state_out}.
 Depth vector: bin i of {bins} is centred on i * {resolution_deg} - {half_deg} degrees from straight ahead,
 counter-clockwise, and {resolution_deg} degrees wide; it holds the mean range of the returns in it in metres,
 0 where there is none. Readings of {max_range} m or more, not positive or not finite are no returns.{circle}
-Poses, from x = y = heading = 0: direction = heading + {fraction} * turn; x += distance * cos(direction);
-y += distance * sin(direction); heading += turn.
+Poses, from x = y = heading = 0: x += cos(heading) * step_x - sin(heading) * step_y;
+y += sin(heading) * step_x + cos(heading) * step_y; heading += step_heading.
 int8 files need ONNX Runtime, which has the operator MatMulNBits.
 The metadata "{key}" holds the sensor and what else an odometer needs, as JSON."""
 
@@ -52,51 +52,43 @@ The metadata "{key}" holds the sensor and what else an odometer needs, as JSON."
 class _Step(nn.Module):
     """What the file computes."""
 
-    def __init__(self, module: OdometryModule) -> None:
+    def __init__(self, model: TrainedModel) -> None:
         super().__init__()
-        self.network, self.uncertainty = module.network, module.uncertainty
+        self.model = model
 
-    def forward(self, scans: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
-        """Motion and deviation (1, 2) of scans (1, 2, bins); with h and c (layers, 1, hidden) these too."""
-        before = tuple(zip(*states, strict=True)) if states else None
-        estimate, after = self.network(scans[None], before)
-        deviation = self.uncertainty(estimate, self.network.head)
-        outputs = estimate.motion[0], deviation[0]
-        return outputs if after is None else (*outputs, *map(torch.stack, zip(*after, strict=True)))
+    def forward(self, scans: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
+        """Step (1, 3), covariance (1, 3, 3) and the state after it, of scans (1, 2, bins) and the state."""
+        steps, covariances, after = self.model(scans[None], state)
+        return steps[0], covariances[0], *after
 
 
-def to_onnx(module: OdometryModule, precision: str) -> "onnx.ModelProto":
-    """The graph of one step of a trained module, with all that its user has to know.
+def to_onnx(model: TrainedModel, precision: str) -> "onnx.ModelProto":
+    """The graph of one step of a trained model, with all that its user has to know.
 
     Args:
-        module: in evaluation mode.
+        model: in evaluation mode, on the CPU.
         precision: ``fp32``, or ``int8``: the weights of all products in 8 bits, those of ``BLOCK`` inputs
             under one scale; the convolutions, whose weights are few, stay in fp32.
     """
-    model = _trace(module)
+    graph = _trace(model)
     if precision == "int8":
-        model = _quantize(model)
+        graph = _quantize(graph)
     else:
-        _matmul_to_convolution(model)
-    _describe(model, module)
-    write_metadata(model, _metadata(module) | {"precision": precision})
-    return model
+        _matmul_to_convolution(graph)
+    _describe(graph, model)
+    write_metadata(graph, _metadata(model) | {"precision": precision})
+    return graph
 
 
-def write(model: "onnx.ModelProto", path: Path) -> None:
+def write(graph: "onnx.ModelProto", path: Path) -> None:
     """Writes the file, whole or not at all.
 
     Raises:
         InputError: it cannot be written.
     """
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        partial.write_bytes(model.SerializeToString())
-        partial.replace(path)
+        write_atomically(path, graph.SerializeToString())
     except OSError as error:
-        with suppress(OSError):
-            partial.unlink(missing_ok=True)
         raise InputError(f"{path}: cannot be written ({error.strerror}); choose another --out") from error
 
 
@@ -107,46 +99,69 @@ def write_metadata(model: "onnx.ModelProto", content: dict[str, Any]) -> None:
     helper.set_model_props(model, {METADATA: json.dumps(content), "about": model.doc_string})
 
 
-def check(stepper: OnnxStepper, module: OdometryModule) -> None:
-    """Compares a graph with its module over steps of random scans with a carried state, deviations too.
+def check(stepper: OnnxStepper, model: TrainedModel) -> None:
+    """Compares a graph with its model over steps of random scans with a carried state, covariances too.
 
     Raises:
-        InputError: it does not do what the module does.
+        InputError: it does not do what the model does.
     """
     rng = np.random.default_rng(0)
-    scans = rng.uniform(0, module.sensor.max_range, (CHECKED_STEPS + 1, module.sensor.bins))
+    scans = rng.uniform(0, model.sensor.max_range, (CHECKED_STEPS + 1, model.sensor.bins))
     scans[rng.random(scans.shape) < 0.5] = 0
     pairs = [scans[frame : frame + 2].astype(np.float32) for frame in range(CHECKED_STEPS)]
-    reference, precision = CheckpointStepper(module), stepper.metadata["precision"]
-    stepper.reset()
-    got, expected = (np.array([step(pair) for pair in pairs]) for step in (stepper, reference))
-    stepper.reset()
-    if not module.uncertainty.fitted:
-        got, expected = got[:, :1], expected[:, :1]
-    difference = float(np.max(np.abs(got - expected) / module.network.head.deviation.numpy()))
+    got, expected = (_stream(each, pairs) for each in (stepper, TorchStepper(model)))
+    difference = _difference(got, expected, np.array(model.describe().typical_step))
+    precision = stepper.metadata["precision"]
     if not difference <= TOLERANCE[precision]:
         raise InputError(
-            f"the {precision} graph differs from its checkpoint by {difference:.2g} deviations of the "
-            f"training motions, more than {TOLERANCE[precision]:g}; it is not written"
+            f"the {precision} graph differs from its checkpoint by {difference:.2g} of a typical step of the "
+            f"training, more than {TOLERANCE[precision]:g}; it is not written"
         )
 
 
-def _trace(module: OdometryModule) -> "onnx.ModelProto":
+def _difference(got: FloatArray, expected: FloatArray, typical: FloatArray) -> float:
+    """The largest difference between steps (N, 3, 4) of :func:`_stream`, in typical steps (3,).
+
+    It is inf where one knows what is unknown to the other.
+    """
+    known = np.isfinite(expected)
+    known[..., 0] = True  # nan is no step
+    if (np.isfinite(got) != known).any():
+        return float("inf")
+    # A robot that hardly moves sideways has no scale of its own for that: x and y share one.
+    metres = np.sqrt(np.nansum(np.square(typical[:2])))
+    units = np.array([metres, metres, typical[2]])
+    units = np.where(units > 0, units, 1.0)
+    # What a deviation is wrong by stands in its square times twice the deviation.
+    deviations = np.sqrt(np.abs(np.nan_to_num(np.diagonal(expected[..., 1:], axis1=1, axis2=2))))
+    scales = np.empty_like(expected)
+    scales[..., 0] = units
+    scales[..., 1:] = np.outer(units, units) + deviations[:, :, None] * deviations[:, None, :]
+    return float(np.max((np.abs(got - expected) / scales)[known]))
+
+
+def _stream(stepper: Stepper, pairs: list[Any]) -> FloatArray:
+    """Steps (N, 3, 4) from the beginning on: x, y and heading in the first column, covariances beside it."""
+    stepper.reset()
+    steps = [stepper(pair) for pair in pairs]
+    stepper.reset()
+    return np.array([np.column_stack([step.array(), step.covariance]) for step in steps])
+
+
+def _trace(model: TrainedModel) -> "onnx.ModelProto":
     """The graph in fp32, every product a ``MatMul`` with its weights."""
-    names, arguments = ["scans"], [torch.zeros(1, 2, module.sensor.bins)]
-    if isinstance(module.network, RCNN):
-        lstm = module.network.lstm
-        shape = len(lstm.weight_ih), 1, lstm.hidden
-        names, arguments = [*names, "h", "c"], [*arguments, torch.zeros(shape), torch.ones(shape)]
-    outputs = ["motion", "deviation", *(f"{name}_out" for name in names[1:])]
+    # One tensor for two states, as zeros may be, would make them one input.
+    state = {name: value.clone() for name, value in model.initial_state().items()}
+    arguments = torch.zeros(1, 2, model.sensor.bins), *state.values()
+    outputs = ["step", "covariance", *(f"{name}_out" for name in state)]
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
-            _Step(module).eval(), tuple(arguments), dynamo=True, input_names=names, output_names=outputs
+            _Step(model).eval(), arguments, dynamo=True, input_names=["scans", *state], output_names=outputs
         )
     assert program is not None
-    model = program.model_proto
-    _gemm_to_matmul(model)
-    return model
+    graph = program.model_proto
+    _gemm_to_matmul(graph)
+    return graph
 
 
 def _quantize(model: "onnx.ModelProto") -> "onnx.ModelProto":
@@ -232,30 +247,42 @@ def _point_convolution(node: Any, weight: Any, constants: Any, rank: int) -> lis
     return nodes
 
 
-def _describe(model: "onnx.ModelProto", module: OdometryModule) -> None:
+def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
     """In words what goes in and comes out."""
-    sensor, shapes = module.sensor, [i.type.tensor_type.shape.dim for i in model.graph.input]
-    recurrent = isinstance(module.network, RCNN)
-    shape = tuple(dim.dim_value for dim in shapes[-1])
-    model.doc_string = ABOUT.format(
+    sensor, state = model.sensor, model.initial_state()
+    names = " and ".join(f"{name} {tuple(value.shape)}" for name, value in state.items())
+    after = " and ".join(f"{name}_out" for name in state)
+    graph.doc_string = ABOUT.format(
         **sensor.as_dict(),
         bins=sensor.bins,
         half_deg=sensor.field_of_view_deg / 2,
-        state_in=f"; h and c {shape}, the LSTM's state, zeros at first" if recurrent else "",
-        state_out="; h_out and c_out, the state for the next step" if recurrent else "",
+        state_in=f"; {names}, the network's state, zeros at first" if state else "",
+        state_out=f"; {after}, the state for the next step" if state else "",
         circle=" The last bin repeats the first." if sensor.field_of_view_deg == 360 else "",
-        fraction=STEP_FRACTION[module.scoring["apply"]],
         key=METADATA,
     )
-    model.producer_name, model.producer_version = "rcnn-odom", __version__
-    for node in model.graph.node:  # where each came from in this project's code, of no use to others
+    graph.producer_name, graph.producer_version = "rcnn-odom", __version__
+    for node in graph.graph.node:  # where each came from in this project's code, of no use to others
         del node.metadata_props[:]
 
 
-def _metadata(module: OdometryModule) -> dict[str, Any]:
-    described = asdict(describe(module))  # JSON has no nan
-    described = {key: None if value != value else value for key, value in described.items()}
-    return {"version": __version__, "variant": module.variant, **described}
+def _metadata(model: TrainedModel) -> dict[str, Any]:
+    told = asdict(model.describe())
+    typical = [_or_null(value) for value in told.pop("typical_step")]
+    sensor = told.pop("sensor")
+    return {
+        "version": __version__,
+        "variant": model.name,
+        "format": FORMAT,
+        "sensor": sensor,
+        "typical_step": typical,
+        **{key: _or_null(value) for key, value in told.items()},
+    }
+
+
+def _or_null(value: float) -> float | None:
+    """JSON has no nan."""
+    return None if np.isnan(value) else value
 
 
 @contextmanager

@@ -28,15 +28,7 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
         try:
             yield
         except ProcessRaisedException as error:
-            for line in str(error).splitlines():
-                kind, _, message = line.partition(":")
-                if kind == f"{InputError.__module__}.{InputError.__name__}":
-                    raise InputError(message.strip()) from error
-                if kind == OSError.__name__:
-                    raise InputError(f"{message.strip()}; make room, and the same command goes on") from error
-                if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
-                    raise Stopped from error
-            raise
+            raise _translate(error, asked=bool(asked)) from error
         except ProcessExitedException as error:
             if asked:
                 raise Stopped from error
@@ -44,6 +36,19 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
                 "a training process was killed, perhaps for want of memory; the same command goes on from "
                 "the last checkpoint"
             ) from error
+
+
+def _translate(error: ProcessRaisedException, *, asked: bool) -> Exception:
+    """The error behind the traceback of another process, which is all that comes from there."""
+    for line in str(error).splitlines():
+        kind, _, message = line.partition(":")
+        if kind == f"{InputError.__module__}.{InputError.__name__}":
+            return InputError(message.strip())
+        if kind == OSError.__name__:
+            return InputError(f"{message.strip()}; make room, and the same command goes on")
+        if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
+            return Stopped()
+    return error
 
 
 @contextmanager

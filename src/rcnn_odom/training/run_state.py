@@ -1,19 +1,23 @@
-"""Run folders: what is in them, and how one is found again."""
+"""What a run is: new, stopped, finished, a twin of a finished one, or in another process' hands."""
 
+import ast
 import hashlib
+import inspect
 import json
 import logging
 import os
-from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from collections.abc import Iterable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from enum import Enum, auto
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import yaml
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.files import held
+from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, RUNNING, read_metrics_file, read_settings
+from rcnn_odom.files import lock_if_free, write_atomically
 from rcnn_odom.training.settings import Settings
 
 if TYPE_CHECKING:  # torch would make --help slow
@@ -21,121 +25,198 @@ if TYPE_CHECKING:  # torch would make --help slow
 
 log = logging.getLogger(__name__)
 
-RECIPE_VERSION = 3
-"""Raised whenever the same settings train another network, so that an older first stage is not taken."""
+PACKAGE = Path(__file__).parents[1]
+DECIDING = (
+    "geometry.py",
+    *("models/*.py", "recordings/*.py", "simulation/**/*.py"),
+    *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/fresh_worlds.py"),
+    *("evaluation/drift.py", "evaluation/drift_metric.py"),
+)
+"""Sources that decide what a training gives."""
 
-CONFIG, METRICS = "config.yaml", "metrics.json"
-RUNNING = ".running.lock"
-"""Held while a run is trained."""
-BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
+LINKED = (CONFIG, METRICS, "train.log", "checkpoints", "trajectories", "figures")
+"""What of a run is also seen in ``outputs/latest``: not its curves, which TensorBoard would show twice."""
 
 
-def start_run(run: Path, settings: Settings) -> None:
-    """Makes a run's folder with its resolved configuration, or enters one that was stopped.
+ELSEWHERE = {"run_dir": None, "outputs": None}
+"""Settings that say where a run is, not what it is."""
+
+
+class State(Enum):
+    """What a run's folder holds."""
+
+    NEW = auto()
+    STOPPED = auto()  # begun with these settings and not finished, and no process trains it
+    FINISHED = auto()
+    TWIN = auto()  # not finished, but another run has finished the very same training
+    LOCKED = auto()  # another process trains it
+    OTHER = auto()  # a run with other settings, or on other recordings
+
+
+class Fingerprints(NamedTuple):
+    """Hashes of all that decides what a training gives.
+
+    Attributes:
+        settings: recordings, options, seed: whether a stopped run may go on from its checkpoint.
+        code: whether, beside them, a finished run would come out the same today.
+    """
+
+    settings: str
+    code: str
+
+
+class Found(NamedTuple):
+    """A run's state, and the folder that has the weights: of a twin not the run's own."""
+
+    state: State
+    run: Path
+
+
+def state_of(
+    run: Path, settings: Settings, wanted: Fingerprints | None = None, twins_in: Path | None = None
+) -> Found:
+    """What a run is; the only place that decides it.
+
+    Args:
+        run: its folder, which need not exist.
+        settings: of the training that is wanted.
+        wanted: its fingerprints, once its recordings are known.
+        twins_in: where to look for a finished run with the same fingerprints; None: nowhere.
 
     Raises:
-        InputError: the folder holds a finished run or one with other settings, or cannot be written.
+        InputError: the folder has a configuration that is none of a run.
     """
-    config = run / CONFIG
+    begun = (run / CONFIG).exists()
+    is_same = begun and read_settings(run) | ELSEWHERE == settings | ELSEWHERE
+    if (run / METRICS).exists():
+        metrics = _metrics_of(run) if is_same else {}
+        finished = metrics and (wanted is None or metrics.get("fingerprint") == wanted.settings)
+        return Found(State.FINISHED if finished else State.OTHER, run)
+    if begun and not is_same:
+        return Found(State.OTHER, run)
+    if run.resolve() not in _claims and run.is_dir():
+        with lock_if_free(run / RUNNING) as free:
+            if not free:
+                return Found(State.LOCKED, run)
+    if twins_in and wanted and (twin := _find_twin(twins_in, wanted)):
+        return Found(State.TWIN, twin)
+    return Found(State.STOPPED if begun else State.NEW, run)
+
+
+def _metrics_of(run: Path) -> dict[str, Any]:
+    """What a run's ``metrics.json`` holds; nothing where that is damaged."""
+    with suppress(OSError, ValueError):
+        return read_metrics_file(run)
+    return {}
+
+
+def _find_twin(outputs: Path, wanted: Fingerprints) -> Path | None:
+    """The newest finished run with these fingerprints."""
+    for path in sorted(outputs.rglob(METRICS), key=lambda path: path.lstat().st_mtime, reverse=True):
+        metrics = _metrics_of(path.parent) if (path.parent / BEST).exists() else {}
+        if not path.is_symlink() and (metrics.get("fingerprint"), metrics.get("code")) == wanted:
+            return path.parent
+    return None
+
+
+def find_stopped(folder: Path, settings: Settings) -> Path | None:
+    """The newest stopped run with these settings in a folder; from here on it is this process' own."""
+    runs = [config.parent for config in folder.glob(f"*/{CONFIG}")]
+    for run in sorted(runs, key=lambda run: (run / CONFIG).stat().st_mtime, reverse=True):
+        with suppress(InputError, OSError):  # of a stranger's folder
+            # The second look is for what another process did between the first and the lock.
+            if state_of(run, settings).state is State.STOPPED and _claim(run):
+                if state_of(run, settings).state is State.STOPPED:
+                    return run
+                _release(run)
+    return None
+
+
+_claims: dict[Path, ExitStack] = {}
+"""Locks of the runs that are this process' own, until it lets go of them or ends."""
+
+
+def _claim(run: Path) -> bool:
+    """Makes a run this process' own, unless another process has it."""
+    with ExitStack() as stack:
+        if run.resolve() not in _claims:
+            if not stack.enter_context(lock_if_free(run / RUNNING)):
+                return False
+            _claims[run.resolve()] = stack.pop_all()
+    return True
+
+
+def _release(run: Path) -> None:
+    _claims.pop(run.resolve()).close()
+
+
+@contextmanager
+def entered(run: Path, settings: Settings) -> Iterator[None]:
+    """Makes a run's folder with its resolved configuration, or enters a stopped run.
+
+    Other processes are kept away from it until the end.
+
+    Raises:
+        InputError: it is finished, has other settings, is trained by another process, or cannot be written.
+    """
     if (run / METRICS).exists():
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
-    if config.exists() and not _same(read_settings(run), settings):
+    if state_of(run, settings).state is State.OTHER:
         raise InputError(
-            f"{config}: the run was begun with other settings; repeat them, or choose another run_dir"
+            f"{run / CONFIG}: the run was begun with other settings; repeat them, or choose another run_dir"
         )
     try:
+        run.mkdir(parents=True, exist_ok=True)
+        if not _claim(run):
+            raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
         write_config(run, settings)
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
     log.info("run %s, seed %d", run, settings["seed"])
-
-
-@contextmanager
-def claimed(run: Path) -> Iterator[None]:
-    """Makes a run's folder where missing, and keeps other processes away from it while it is trained.
-
-    Raises:
-        InputError: another process trains it, or the folder cannot be made.
-    """
     try:
-        run.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{run}: cannot be made ({error.strerror}); choose another run_dir") from error
-    with held(run / RUNNING) as mine:
-        if not mine:
-            raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
         yield
-
-
-def find_stopped(folder: Path, settings: Settings) -> Path | None:
-    """The newest run in a folder that was begun with these settings, is not finished, and runs no more."""
-    runs = [config.parent for config in folder.glob(f"*/{CONFIG}")]
-    for run in sorted(runs, key=lambda run: (run / CONFIG).stat().st_mtime, reverse=True):
-        with suppress(InputError, OSError):  # of a stranger's folder
-            if (run / METRICS).exists() or not _same(read_settings(run), settings):
-                continue
-            with held(run / RUNNING) as stopped:
-                if stopped:
-                    return run
-    return None
-
-
-def finished(run: Path, settings: Settings) -> dict[str, Any] | None:
-    """What the ``metrics.json`` of a run holds if it was finished with these settings."""
-    try:
-        metrics: dict[str, Any] = json.loads((run / METRICS).read_text())
-        return metrics if _same(read_settings(run), settings) else None
-    except (OSError, ValueError, InputError):
-        return None
-
-
-def _same(first: Settings, second: Settings) -> bool:
-    """Whether two configurations are of one run, wherever its folder now is."""
-    elsewhere = {"run_dir": None, "outputs": None}
-    return first | elsewhere == second | elsewhere
-
-
-def write_config(folder: Path, settings: Settings) -> None:
-    """The settings into a folder, at once or not at all."""
-    folder.mkdir(parents=True, exist_ok=True)
-    _write(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
-
-
-def point_latest(outputs: Path, run: Path) -> None:
-    """Lets ``latest`` among the runs point to this one."""
-    link = outputs / f".latest.{os.getpid()}"
-    link.symlink_to(os.path.relpath(run.resolve(), outputs.resolve()))
-    try:
-        link.replace(outputs / "latest")
     finally:
-        link.unlink(missing_ok=True)
+        _release(run)
 
 
-def read_settings(run: Path) -> Settings:
-    """The configuration that a run was started with.
+def check_checkpoint(path: Path, saved: dict[str, Any], wanted: Fingerprints) -> None:
+    """Looks whether a stopped training may go on from what it saved; says so if the code changed since.
+
+    Args:
+        path: of the checkpoint ``saved``.
+        wanted: fingerprints of the training that is to go on.
 
     Raises:
-        InputError: there is no run, or its configuration cannot be read.
+        InputError: the checkpoint belongs to another training.
     """
-    try:
-        settings = yaml.safe_load((run / CONFIG).read_text())
-    except OSError as error:
-        raise InputError(f"{run / CONFIG}: {error.strerror}; name a run's folder, run=outputs/...") from error
-    except (yaml.YAMLError, UnicodeDecodeError):
-        settings = None
-    if not isinstance(settings, dict) or not {"data", "model", "trainer"} <= settings.keys():
-        raise InputError(f"{run / CONFIG}: not the configuration of a run; name another, run=outputs/...")
-    return settings
+    if saved.get("fingerprint") != wanted.settings:
+        raise InputError(
+            f"{path}: saved by a training on other recordings or with another version of rcnn_odom; "
+            "choose another run_dir, or remove it to begin again"
+        )
+    if saved.get("code") != wanted.code:
+        log.info("the code has changed since this run began; what follows is trained by the new code")
 
 
-def fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
-    """Hash of everything that decides what a training gives: recordings, network, recipe, seed."""
+def fingerprints(settings: Settings, datamodule: "OdometryDataModule") -> Fingerprints:
+    """Those of a training whose recordings are loaded."""
+    from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
+    from rcnn_odom.recordings.formats import find_format
+
+    # Models and formats may come from other packages.
+    parts = find_model(settings["model"]["variant"]), find_format(settings["data"]["reader"]["format"])
+    sources = [Path(inspect.getsourcefile(part) or "") for part in parts]
+    return Fingerprints(settings_fingerprint(settings, datamodule), code_fingerprint(PACKAGE, sources))
+
+
+def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
+    """Hash of a training's recordings, options and seed."""
     from rcnn_odom.training.machine import resolve_precision  # with torch, which would make --help slow
 
     recordings = {
         split: [
-            (sequence.key, sequence.name, hashlib.sha256(np.round(sequence.poses, 6).tobytes()).hexdigest())
-            for sequence in datamodule.sequences[split]
+            (drive.key, drive.name, hashlib.sha256(np.round(drive.poses, 6).tobytes()).hexdigest())
+            for drive in datamodule.drives[split]
         ]
         for split in ("train", "val")
     }
@@ -144,33 +225,53 @@ def fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
         data["fresh_worlds"] = settings["data"]["reader"]
     trainer = settings["trainer"]
     precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
-    parts = [RECIPE_VERSION, recordings, data, settings["model"], trainer | {"precision": precision}]
-    parts.append(settings["seed"])
+    parts = [recordings, data, settings["model"], trainer | {"precision": precision}, settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def find_run(outputs: Path, wanted: str) -> Path | None:
-    """The best checkpoint of a finished run with this fingerprint, the newest if there are several."""
-    found = []
-    for metrics in outputs.rglob(METRICS):
-        try:
-            if json.loads(metrics.read_text())["fingerprint"] == wanted and (metrics.parent / BEST).exists():
-                found.append(metrics)
-        except (ValueError, KeyError, TypeError, OSError):
-            continue  # not a finished run of ours
-    newest = max(found, key=lambda path: path.stat().st_mtime, default=None)
-    return newest.parent / BEST if newest else None
+def code_fingerprint(package: Path, others: Iterable[Path] = ()) -> str:
+    """Hash of the statements that decide a training: comments, docstrings and layout do not count.
+
+    Args:
+        package: the folder of ``rcnn_odom``.
+        others: source files outside of it; those inside count once.
+    """
+    inside = {path for pattern in DECIDING for path in package.glob(pattern)}
+    statements = hashlib.sha256()
+    for path in [*sorted(inside), *sorted(set(others) - inside)]:
+        tree = ast.parse(path.read_bytes())
+        for node in ast.walk(tree):
+            body = getattr(node, "body", None)
+            if isinstance(body, list):  # a constant that stands alone does nothing
+                node.body = [one for one in body if not _is_constant(one)]  # type: ignore[attr-defined]
+        statements.update(f"{path.name}: {ast.dump(tree)}\n".encode())
+    return statements.hexdigest()[:16]
+
+
+def _is_constant(statement: ast.stmt) -> bool:
+    return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
+
+
+def write_config(folder: Path, settings: Settings) -> None:
+    """The settings into a folder, at once or not at all."""
+    write_atomically(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
     """Writes a JSON file at once or not at all."""
-    _write(path, json.dumps(content, indent=2) + "\n")
+    write_atomically(path, json.dumps(content, indent=2) + "\n")
 
 
-def _write(path: Path, text: str) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    with partial.open("w") as file:
-        file.write(text)
-        file.flush()
-        os.fsync(file.fileno())
-    partial.replace(path)
+def point_latest(outputs: Path, run: Path) -> None:
+    """Lets ``latest`` among the runs show this one: a folder of links, also to what is not there yet."""
+    latest = outputs / "latest"
+    if latest.is_symlink():  # as earlier versions left it
+        latest.unlink()
+    latest.mkdir(exist_ok=True)
+    for name in LINKED:
+        link = latest / f".{name}.{os.getpid()}"
+        link.symlink_to(os.path.relpath(run.resolve() / name, latest.resolve()))
+        try:
+            link.replace(latest / name)
+        finally:
+            link.unlink(missing_ok=True)

@@ -6,6 +6,7 @@ import signal
 import threading
 import time
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -16,18 +17,14 @@ from lightning.pytorch.callbacks import Callback, ModelCheckpoint
 from lightning.pytorch.loggers import TensorBoardLogger
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.files import write_atomically
 
 EVERY = 60.0
 """Seconds between checkpoints within an epoch; saving the largest network takes less than one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-NOTHING, SAVE, STOP = 0, 1, 2
+CONTINUE, SAVE, STOP = 0, 1, 2
+"""What a process wants to happen after a step; the most that any of them wants is done."""
 STDERR = 2
-
-
-def starter_lives() -> bool:
-    """Whether this process was started by another one that is still there."""
-    starter = multiprocessing.parent_process()
-    return starter is not None and starter.pid == os.getppid()
 
 
 class Stopped(Exception):
@@ -40,16 +37,9 @@ def save_atomically(content: dict[str, Any], path: Path) -> None:
     Raises:
         InputError: it cannot be written; what was there before still is.
     """
-    partial = path.with_name(f".{path.name}.partial")
     try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with partial.open("wb") as file:
-            torch.save(content, file)
-            file.flush()
-            os.fsync(file.fileno())
-        partial.replace(path)
+        write_atomically(path, partial(torch.save, content))
     except (OSError, RuntimeError) as error:  # torch's writer turns an OSError into the latter
-        partial.unlink(missing_ok=True)
         cause = error.__context__ if isinstance(error.__context__, OSError) else error
         reason = cause.strerror if isinstance(cause, OSError) else str(error).splitlines()[0]
         kept = "the one before is kept; " if path.exists() else ""
@@ -106,24 +96,25 @@ class Saving(Callback):
 
     def __init__(self, path: Path) -> None:
         self.path = path
-        self._asked = False
+        self._asked_to_stop = False
         self._within_epoch = False
-        self._saved = 0.0
+        self._last_saved = 0.0
         self._handlers: dict[signal.Signals, Any] = {}
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Listens to the signals from now on."""
-        self._saved = time.monotonic()
+        self._last_saved = time.monotonic()
         self._several = trainer.world_size > 1
         if threading.current_thread() is threading.main_thread():  # no other can
-            self._handlers = {number: signal.signal(number, self._ask) for number in SIGNALS}
+            self._handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
 
-    def _ask(self, number: int, frame: object) -> None:
-        if number == signal.SIGINT and self._several and starter_lives():
+    def _on_signal(self, number: int, frame: object) -> None:
+        starter = multiprocessing.parent_process() if self._several else None
+        if number == signal.SIGINT and starter is not None and starter.pid == os.getppid():
             return  # Ctrl-C reaches all processes of a terminal; the one that started this one passes it on
-        if self._asked or not self._within_epoch:
+        if self._asked_to_stop or not self._within_epoch:
             raise KeyboardInterrupt
-        self._asked = True
+        self._asked_to_stop = True
         # Not by logging, in the middle of which the signal may have come.
         with suppress(OSError):  # nobody may be there to read it
             os.write(STDERR, b"stopping as soon as this step or validation is done and saved\n")
@@ -140,8 +131,8 @@ class Saving(Callback):
         """A moment that can be saved, except right before the validation, which belongs to the epoch."""
         if trainer.is_last_batch:
             return
-        due = SAVE if time.monotonic() - self._saved > EVERY else NOTHING
-        wanted = self._agree(trainer, STOP if self._asked else due)
+        due = SAVE if time.monotonic() - self._last_saved > EVERY else CONTINUE
+        wanted = self._agree(trainer, STOP if self._asked_to_stop else due)
         if wanted:
             self._save(trainer)
         if wanted == STOP:
@@ -151,7 +142,7 @@ class Saving(Callback):
         """Called after the validation."""
         self._save(trainer)
         self._within_epoch = False
-        if self._agree(trainer, STOP if self._asked else NOTHING) == STOP:
+        if self._agree(trainer, STOP if self._asked_to_stop else CONTINUE) == STOP:
             raise Stopped
 
     def _agree(self, trainer: L.Trainer, wanted: int) -> int:
@@ -168,18 +159,15 @@ class Saving(Callback):
             assert isinstance(trainer.logger, TensorBoardLogger)
             trainer.logger.experiment.flush()
         trainer.save_checkpoint(self.path)
-        self._saved = time.monotonic()
+        self._last_saved = time.monotonic()
 
     def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Gives the signals back."""
-        self._restore()
+        while self._handlers:
+            signal.signal(*self._handlers.popitem())
 
     def on_exception(
         self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
     ) -> None:
         """Gives the signals back."""
-        self._restore()
-
-    def _restore(self) -> None:
-        while self._handlers:
-            signal.signal(*self._handlers.popitem())
+        self.on_train_end(trainer, pl_module)

@@ -1,76 +1,89 @@
-"""The steps of one experiment, as ``train.py`` and ``evaluate.py`` call them."""
+"""The steps of one training: a first stage where the model has one, then the model, then its scores."""
 
-import json
 import logging
+import pickle
 import shutil
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING
 
 import lightning as L
-from hydra.utils import instantiate
 from lightning.pytorch.loggers import TensorBoardLogger
 from lightning.pytorch.plugins.environments import LightningEnvironment
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import fitting_lengths
-from rcnn_odom.evaluation.run_report import Estimates, report_test
-from rcnn_odom.evaluation.scores import Report
+from rcnn_odom.evaluation.metrics import Report
+from rcnn_odom.evaluation.run_folder import BEST, LAST, METRICS, Settings, read_metrics_file
+from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.files import one_at_a_time
+from rcnn_odom.geometry import Steps
+from rcnn_odom.models.contract import find_model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.formats import open_recording
 from rcnn_odom.recordings.trajectory import flatten
 from rcnn_odom.training.checkpoint import calibrate, load_module, read_checkpoint
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import resolve_precision
-from rcnn_odom.training.modules import VARIANTS, CNNClassification, OdometryModule, RecurrentModule
+from rcnn_odom.training.modules import OdometryModule, module_for
 from rcnn_odom.training.processes import one_line_errors
-from rcnn_odom.training.run_state import BEST, LAST, METRICS, find_run, fingerprint, start_run, write_json
-from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving
-from rcnn_odom.training.settings import Settings
+from rcnn_odom.training.run_state import (
+    Fingerprints,
+    State,
+    check_checkpoint,
+    entered,
+    fingerprints,
+    point_latest,
+    state_of,
+    write_json,
+)
+from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped
 from rcnn_odom.training.tensorboard import Layout, log_run
 from rcnn_odom.training.training_log import TrainingLog
 
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
 log = logging.getLogger(__name__)
+
+NOT_OF_THE_NETWORK = ("variant", "first_stage", "pretrained")
+"""Options that a checkpoint does not keep: it says what a network is, not where its first stage came from."""
 
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
     """The DataModule of a configuration; nothing has been read yet."""
     data, model = settings["data"], settings["model"]
+    recipe = {key: model[key] for key in ("window", "batch_size") if key in model}
     return OdometryDataModule(
-        # Plain values travel to the workers; Hydra's own containers would bring all of Hydra along.
-        read=instantiate({**data["reader"], "_partial_": True, "_convert_": "all"}),
+        open_recording=open_recording(data["reader"]),
         train=data["train"],
         val=data["val"],
         test=data["test"],
         sensor=Sensor(**data["sensor"]),
         cache_dir=Path(settings["outputs"]) / "cache",
-        window=model["window"],
-        batch_size=model["batch_size"],
         workers=data["workers"],
-        seed=settings["seed"],
-        fresh_epochs=model["epochs"] if data.get("fresh_worlds") else 0,
-        # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
-        fresh_first=model["first_stage"]["epochs"] if "first_stage" in model else 0,
+        seed=settings.get("seed", 0),
+        fresh_epochs=model.get("epochs", 0) if data.get("fresh_worlds") else 0,
         worlds_dir=None if data.get("keep_worlds") else Path(settings["run_dir"]) / "worlds",
+        **recipe,
         **data["augment"],
     )
 
 
 def build_module(settings: Settings, datamodule: OdometryDataModule) -> OdometryModule:
     """An untrained module for these data, its weights drawn from the seed."""
-    data = settings["data"]
-    truths = [flatten(sequence.camera_poses) for sequence in datamodule.sequences["val"]]
+    data, model = settings["data"], settings["model"]
+    truths = [flatten(drive.camera_poses) for drive in datamodule.drives["val"]]
     lengths = list(fitting_lengths(truths, data["lengths"]))
     if lengths != data["lengths"]:
         log.info("validation is too short for data.lengths: its drift is measured over %s m", lengths)
-    # A checkpoint tells what the network is, not where its first stage came from.
-    model = {
-        key: value for key, value in settings["model"].items() if key not in ("first_stage", "pretrained")
-    }
+    options = {key: value for key, value in model.items() if key not in NOT_OF_THE_NETWORK}
     L.seed_everything(settings["seed"], verbose=False)
-    module = VARIANTS[model["variant"]](model, data["sensor"], {"lengths": lengths, "apply": data["apply"]})
-    module.set_motion_statistics(*datamodule.motion_statistics())
+    module = module_for(model["variant"])(options, data["sensor"], lengths)
+    module.set_units(datamodule.training_steps())
     return module
 
 
@@ -118,10 +131,51 @@ def _training_options(settings: Settings, run: Path) -> Settings:
     }
 
 
+def train(settings: Settings, *, reuse: bool = False) -> Report:
+    """Everything that one run does; returns what its ``metrics.json`` holds.
+
+    Args:
+        settings: its configuration, plain.
+        reuse: as a sweep's job does, leave it at that where the run is finished already, and take the
+            weights of a finished run with the very same training.
+
+    Raises:
+        InputError: see its message.
+        KeyboardInterrupt: stopped from the keyboard or by a signal; the log says how to go on.
+    """
+    variant, run, outputs = settings["model"]["variant"], Path(settings["run_dir"]), Path(settings["outputs"])
+    if not find_model(variant).trains:
+        raise InputError(
+            f"model={variant} has nothing to train; score it: python evaluate.py model={variant} data=..."
+        )
+    if reuse and state_of(run, settings).state is State.FINISHED:
+        log.info("run %s is finished already", run)
+        return read_metrics_file(run)
+    try:
+        trainer = build_trainer(settings, run)
+        datamodule = build_datamodule(settings)
+        with entered(run, settings):
+            datamodule.load()
+            point_latest(outputs, run)
+            wanted = fingerprints(settings, datamodule)
+            with one_at_a_time(outputs / "cache", wanted.settings, "training the same"):
+                metrics = train_module(settings, datamodule, trainer, wanted, reuse=reuse)
+    except (KeyboardInterrupt, SystemExit, Stopped):  # Lightning ends by the second after the first
+        log.error("stopped; the same command goes on from what is in %s", run)
+        raise KeyboardInterrupt from None
+    log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
+    return metrics
+
+
 def train_module(
-    settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, *, reuse: bool = False
+    settings: Settings,
+    datamodule: OdometryDataModule,
+    trainer: L.Trainer,
+    wanted: Fingerprints,
+    *,
+    reuse: bool = False,
 ) -> Report:
-    """Trains one module, a recurrent one's first stage before it, and scores it on the test sequences.
+    """Trains one model, its first stage before it, and scores it on the test drives.
 
     A run that was stopped or killed goes on from its last checkpoint, to the very same result on a CPU.
 
@@ -129,20 +183,21 @@ def train_module(
         settings: of the run.
         datamodule: its data, loaded.
         trainer: for its folder.
+        wanted: fingerprints of this training.
         reuse: where another run among the outputs has finished the very same training (recordings,
-            network, recipe and seed), its weights are taken instead of training once more.
+            network, recipe, seed and code), its weights are taken instead of training once more.
 
     Returns:
         What ``metrics.json`` holds.
     """
     run = Path(settings["run_dir"])
-    metrics: Report = {"fingerprint": fingerprint(settings, datamodule), "seed": settings["seed"]}
-    twin = find_run(Path(settings["outputs"]), metrics["fingerprint"]) if reuse else None
-    if twin:
-        metrics |= _take_weights(twin, run)
+    metrics: Report = {"fingerprint": wanted.settings, "code": wanted.code, "seed": settings["seed"]}
+    found = state_of(run, settings, wanted, Path(settings["outputs"]) if reuse else None)
+    if found.state is State.TWIN:
+        metrics |= _take_weights(found.run, run)
     else:
-        metrics |= _fit(settings, datamodule, trainer, metrics["fingerprint"])
-    metrics |= finish_run(settings, datamodule, trainer, run)
+        metrics |= _fit(settings, datamodule, trainer, wanted)
+    metrics |= _finish_run(settings, datamodule, trainer, run)
     assert isinstance(trainer.logger, TensorBoardLogger)
     log_run(trainer.logger, settings, metrics, settings["model"]["epochs"] * datamodule.batches_per_epoch)
     write_json(run / METRICS, metrics)
@@ -152,35 +207,29 @@ def train_module(
 
 def _take_weights(twin: Path, run: Path) -> Report:
     """Another run's best checkpoint, and what its ``metrics.json`` says of its training."""
-    told = json.loads((twin.parents[1] / METRICS).read_text())
-    log.info("the same training has been done in %s; its weights are taken", twin.parents[1])
+    metrics = read_metrics_file(twin)
+    log.info("the same training has been done in %s; its weights are taken", twin)
     (run / BEST).parent.mkdir(parents=True, exist_ok=True)
-    shutil.copyfile(twin, run / BEST)
-    kept = {key: told[key] for key in ("first_stage", "training", "val") if key in told}
-    return {**kept, "same_as": told.get("same_as", str(twin.parents[1]))}
+    shutil.copyfile(twin / BEST, run / BEST)
+    kept: Report = {key: metrics[key] for key in ("first_stage", "training", "val") if key in metrics}
+    return kept | {"same_as": metrics.get("same_as", str(twin))}
 
 
-def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, wanted: str) -> Report:
+def _fit(
+    settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, wanted: Fingerprints
+) -> Report:
     """Trains; the part of ``metrics.json`` that is about it.
 
     Raises:
         InputError: the checkpoint that it would go on from belongs to another training.
     """
-    metrics: Report = {}
     last = Path(settings["run_dir"]) / LAST
     module = build_module(settings, datamodule)
-    module.fingerprint = wanted
-    if isinstance(module, RecurrentModule):
-        path, cnn = first_stage(settings, datamodule)
-        module.load_first_stage(cnn)
-        metrics["first_stage"] = str(path)
+    module.fingerprint, module.code = wanted
+    metrics = _begin_with_first_stage(module, settings, datamodule)
     if last.exists():
         saved = read_checkpoint(last)
-        if saved.get("fingerprint") != wanted:
-            raise InputError(
-                f"{last}: saved by a training on other recordings or with another version of rcnn_odom; "
-                "choose another run_dir, or remove it to begin again"
-            )
+        check_checkpoint(last, saved, wanted)
         log.info("going on from %s, step %d", last, saved["global_step"])
         del saved  # its maps would keep the file's place on the disk
     with one_line_errors(trainer):
@@ -190,75 +239,100 @@ def _fit(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer,
     saved = read_checkpoint(last)  # where training in other processes has left it too
     (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("Best"))
     drift = best["best_model_score"]
-    return {
-        **metrics,
+    return metrics | {
         "training": {"seconds": saved["training_log"]["seconds"], "epochs": settings["model"]["epochs"]},
-        "val": {"drift": None if drift is None else float(drift), "lengths": module.scoring["lengths"]},
+        "val": {"drift": None if drift is None else float(drift), "lengths": module.lengths},
     }
 
 
-def finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, run: Path) -> Report:
-    """Scores the checkpoint with the best validation drift on the test sequences.
-
-    Before that its uncertainty is fitted on the validation sequences.
-    """
-    module = calibrate(run / BEST, datamodule.sequences["val"])
-    estimates = estimate_test(module, datamodule, trainer)
-    logger = trainer.logger
-    assert isinstance(logger, TensorBoardLogger)
-    return {
-        "variant": module.variant,
-        "data": settings["data"]["name"],
-        **report_test(module, estimates, datamodule.sequences["test"], settings["data"], run, logger),
-    }
-
-
-def estimate_test(module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer) -> Estimates:
-    """What a network makes of the test sequences."""
-    with TemporaryDirectory() as folder, one_line_errors(trainer):
-        # Other processes cannot hand their estimates over in memory.
-        module.estimates_file = Path(folder) / "estimates.npz" if trainer.world_size > 1 else None
-        trainer.test(module, datamodule=datamodule, verbose=False)
-        if module.estimates_file:
-            module.load_estimates()
-    drives = {s.name: module.estimates[number] for number, s in enumerate(datamodule.sequences["test"])}
-    motions = {name: drive.motions for name, drive in drives.items()}
-    deviations = {name: drive.deviations for name, drive in drives.items()}
-    return Estimates(motions, deviations=deviations if module.uncertainty.fitted else {})
-
-
-def first_stage(settings: Settings, datamodule: OdometryDataModule) -> tuple[Path, CNNClassification]:
-    """Checkpoint and CNN that a recurrent variant starts from: given, found among the runs, or trained now.
-
-    One that is found has the same recordings, network, recipe and seed.
+def _begin_with_first_stage(
+    module: OdometryModule, settings: Settings, datamodule: OdometryDataModule
+) -> Report:
+    """Gives a model its trained first stage, if it has one; the part of ``metrics.json`` about it.
 
     Raises:
-        InputError: the one that was given is of another variant, sensor or network.
+        InputError: the first stage that was given does not fit.
+    """
+    variant = module.model.first_stage
+    if variant is None:
+        return {}
+    path = _find_first_stage(settings, datamodule, variant)
+    log.info("first stage: %s", path)
+    stage = load_module(path, variant, Sensor(**settings["data"]["sensor"]))
+    try:
+        module.model.take_first_stage(stage.model)
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
+    # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
+    datamodule.fresh_first = stage.model.options["epochs"]
+    return {"first_stage": str(path)}
+
+
+def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, variant: str) -> Path:
+    """Checkpoint of the first stage: given, found among the runs, or trained now.
+
+    One that is found has the same recordings, network, recipe and seed, and was trained by the same code.
     """
     model = settings["model"]
-    path = model["pretrained"] and Path(model["pretrained"])
-    if not path:
-        run = Path(settings["run_dir"]) / "first_stage"
-        cnn_settings = {**settings, "model": model["first_stage"], "run_dir": str(run)}
-        cnn_data = build_datamodule(cnn_settings)
-        cnn_data.sequences = datamodule.sequences
-        wanted = fingerprint(cnn_settings, cnn_data)
-        outputs = Path(settings["outputs"])
-        with one_at_a_time(outputs / "cache", wanted, "training the first stage"):
-            # The run's own comes first: it is there when the run was stopped after it.
-            path = find_run(run, wanted) or find_run(outputs, wanted)
-            if path is None:
-                log.info("first stage: no fitting cnn_cls in %s, training one", outputs)
-                start_run(run, cnn_settings)
-                train_module(cnn_settings, cnn_data, build_trainer(cnn_settings, run))
-                path = run / BEST
-    log.info("first stage: %s", path)
-    cnn = load_module(path, "cnn_cls", Sensor(**settings["data"]["sensor"]))
-    for key in ("kernel_size", "pooling", "rotation_classes"):
-        if cnn.model[key] != model[key]:
-            raise InputError(
-                f"{path}: trained with {key}={cnn.model[key]}, but model.{key} is {model[key]}; "
-                "set it as in that training, or leave model.pretrained out"
-            )
-    assert isinstance(cnn, CNNClassification)
-    return path, cnn
+    if model.get("pretrained"):
+        return Path(model["pretrained"])
+    run, outputs = Path(settings["run_dir"]) / "first_stage", Path(settings["outputs"])
+    settings = {**settings, "model": {**model["first_stage"], "variant": variant}, "run_dir": str(run)}
+    stage_data = build_datamodule(settings)
+    stage_data.drives = datamodule.drives
+    wanted = fingerprints(settings, stage_data)
+    with one_at_a_time(outputs / "cache", wanted.settings, "training the first stage"):
+        # The run's own comes first: it is there when the run was stopped after it.
+        found = state_of(run, settings, wanted, outputs)
+        if found.state not in (State.FINISHED, State.TWIN):
+            log.info("first stage: no fitting %s in %s, training one", variant, outputs)
+            with entered(run, settings):
+                train_module(settings, stage_data, build_trainer(settings, run), wanted)
+    return found.run / BEST
+
+
+def _finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, run: Path) -> Report:
+    """Scores the checkpoint with the best validation drift on the test drives.
+
+    Before that its uncertainty is fitted on the validation drives.
+    """
+    module = calibrate(run / BEST, datamodule.drives["val"])
+    assert isinstance(trainer.logger, TensorBoardLogger)
+    add_figure = trainer.logger.experiment.add_figure
+    scores = score_module(module, datamodule, trainer, settings["data"], run, add_figure)
+    return {"variant": module.variant, "data": settings["data"]["name"]} | scores
+
+
+def score_module(
+    module: OdometryModule,
+    datamodule: OdometryDataModule,
+    trainer: L.Trainer,
+    data: Settings,
+    folder: Path,
+    add_figure: "Callable[[str, Figure], None] | None" = None,
+) -> Report:
+    """Estimates the test drives with a network and scores it.
+
+    Args:
+        module: with the network.
+        datamodule: with the test drives.
+        trainer: tests, perhaps in other processes.
+        data, folder, add_figure: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
+    """
+    steps = _estimate_test(module, datamodule, trainer)
+    mean_step, stepper = module.mean_step.double().numpy(), module.model.stepper()
+    drives = datamodule.drives["test"]
+    return report_drives(module.variant, steps, mean_step, stepper, drives, data, folder, add_figure)
+
+
+def _estimate_test(
+    module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer
+) -> dict[str, Steps]:
+    """The steps of the test drives by their names."""
+    with TemporaryDirectory() as folder, one_line_errors(trainer):
+        # Other processes cannot hand their estimates over in memory.
+        module.estimates_file = Path(folder) / "estimates" if trainer.world_size > 1 else None
+        trainer.test(module, datamodule=datamodule, verbose=False)
+        if module.estimates_file:
+            module.estimates = pickle.loads(module.estimates_file.read_bytes())
+    return module.estimates

@@ -32,9 +32,6 @@ def folder_name(overrides: str) -> str:
     return f"{name[:LONGEST_NAME]}-{hashlib.sha256(wanted.encode()).hexdigest()[:8]}"
 
 
-OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
-
-
 def expected_folders(sweep: Path) -> list[str] | None:
     """Names of the folders of all jobs that the last command of a grid sweep asked for.
 

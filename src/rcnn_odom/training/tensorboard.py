@@ -8,23 +8,17 @@ from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torch.utils.tensorboard.summary import hparams
 
-from rcnn_odom.training.settings import Settings, flat
+from rcnn_odom.evaluation.metrics import all_metrics
+from rcnn_odom.evaluation.run_folder import Settings, flat
 
-LAYOUT = {
+LOSS_AND_DRIFT = {
     "Loss": {
         "loss": ["Multiline", ["train/loss_epoch"]],
-        "parts of the loss, of distance and rotation": [
-            "Multiline",
-            ["train/loss_distance_epoch", "train/loss_rotation_epoch"],
-        ],
+        "parts of the loss": ["Multiline", ["train/loss_.*_epoch"]],
     },
     "Drift (ratio)": {
         "validation drift, the mean and each sequence": ["Multiline", ["val/drift.*"]],
         "test drift, the mean and each sequence": ["Multiline", ["drift/test.*"]],
-    },
-    "Mean absolute error of a frame": {
-        "error of distance (m)": ["Multiline", ["(val|test)/distance_mae_m"]],
-        "error of heading (degrees)": ["Multiline", ["(val|test)/heading_mae_deg"]],
     },
 }
 """Groups of charts by title, each with patterns of the scalars in it."""
@@ -39,10 +33,10 @@ NOT_IN_ROW = (
     "data.keep_worlds",
 )
 REPEATED = (
-    *("data.rotation_classes", "data.beta", "data.passes", "data.epochs"),
-    *("model.first_stage.kernel_size", "model.first_stage.pooling", "model.first_stage.rotation_classes"),
+    *("model.apply", "model.first_stage.apply", "model.first_stage.kernel_size"),
+    *("model.first_stage.pooling", "model.first_stage.rotation_classes"),
 )
-"""Settings that only stand for what ``model`` says as well."""
+"""Settings that only repeat another one."""
 
 CHOSEN_AS = {"model.variant": "model", "data.name": "data"}
 """Settings whose column has the name of the choice on the command line, and so comes before its parts."""
@@ -57,7 +51,12 @@ class Layout(Callback):
             return
         assert isinstance(trainer.logger, TensorBoardLogger)
         writer = trainer.logger.experiment
-        writer.add_custom_scalars(LAYOUT)
+        others = {
+            f"{metric.title} ({name})": ["Multiline", [f"(val|test)/{name}"]]
+            for name, metric in all_metrics().items()
+            if metric.in_training and name != "drift"
+        }
+        writer.add_custom_scalars({**LOSS_AND_DRIFT, "Other metrics": others})
         # A run that goes on, or begins again, will log what came after its last checkpoint once more.
         start = SessionLog(status=SessionLog.START)
         writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
@@ -86,10 +85,7 @@ def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, An
     scores = {"drift/validation": metrics["val"]["drift"], "drift/test": test["drift"]}
     for name, scored in test["sequences"].items():
         scores[f"drift/test/{name}"] = scored["drift"]["t_err"]
-    for error in ("distance_mae_m", "heading_mae_deg"):
-        frames = [scored["frames"] - 1 for scored in test["sequences"].values()]
-        errors = [scored[error] for scored in test["sequences"].values()]
-        scores[f"test/{error}"] = sum(f * e for f, e in zip(frames, errors, strict=True)) / sum(frames)
+    scores |= {f"test/{name}": value for name, value in test["metrics"].items() if name != "drift"}
     known = {name: value for name, value in scores.items() if value is not None}
     logger.log_metrics(known, step)
     _, *summaries = hparams(row, known)

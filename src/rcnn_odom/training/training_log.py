@@ -1,4 +1,4 @@
-"""What a training says of itself: a line and a point on every curve for each epoch."""
+"""What a training logs: a line and a point on every curve for each epoch."""
 
 import logging
 import sys
@@ -10,10 +10,10 @@ import lightning as L
 import torch
 from lightning.pytorch.callbacks import Callback
 
-from rcnn_odom.evaluation.scores import percent
+from rcnn_odom.evaluation.metrics import all_metrics
 
 log = logging.getLogger(__name__)
-# Lightning tells of the machine and of its makers' products; what a user needs is said by this project.
+# Lightning logs facts about the machine and advertises products; this project logs what a user needs.
 for library in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(library).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module=library.replace(".", r"\."))
@@ -70,7 +70,7 @@ class TrainingLog(Callback):
     ) -> None:
         """Adds what ``training_step`` returns, scalars by name, to the means; logs every tenth step."""
         values = {name: float(value.detach()) for name, value in outputs.items()}
-        windows = len(batch["motions"])
+        windows = len(batch["steps"])
         self._windows += windows
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + windows * value
@@ -82,14 +82,14 @@ class TrainingLog(Callback):
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Called after the epoch's validation."""
         self.seconds = time.monotonic() - self._begun
-        sums, windows = self._of_all_processes(trainer)
+        sums, windows = self._sums_of_all_processes(trainer)
         means = {name: total / windows for name, total in sums.items()}
         points = {f"train/{name}_epoch": mean for name, mean in means.items()}
         assert trainer.logger is not None
         trainer.logger.log_metrics({"epoch": trainer.current_epoch, **points}, trainer.global_step - 1)
-        self._say(trainer, means["loss"])
+        self._log_line(trainer, means["loss"])
 
-    def _of_all_processes(self, trainer: L.Trainer) -> tuple[dict[str, float], float]:
+    def _sums_of_all_processes(self, trainer: L.Trainer) -> tuple[dict[str, float], float]:
         """Sums and windows of the epoch so far."""
         names = sorted(self._sums)
         here = torch.tensor([*(self._sums[name] for name in names), self._windows], dtype=torch.float64)
@@ -98,28 +98,23 @@ class TrainingLog(Callback):
         ).tolist()
         return dict(zip(names, sums, strict=True)), windows
 
-    def _say(self, trainer: L.Trainer, loss: float) -> None:
+    def _log_line(self, trainer: L.Trainer, loss: float) -> None:
         values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+        shown = ", ".join(
+            f"{metric.title} {metric.show(values.get(f'val/{name}'))} {metric.unit}"
+            for name, metric in all_metrics().items()
+            if metric.in_training
+        )
         worlds = trainer.datamodule.worlds  # type: ignore[attr-defined]
         waited = f"  waited {worlds.waited:.0f} s for new worlds" if worlds and worlds.waited > 0.5 else ""
-        log.info(
-            "epoch %2d/%d  loss %.4f  validation: drift %5s %%, mean error a frame %.3f m %.3f deg  %4.0f s"
-            "%s",
-            trainer.current_epoch + 1,
-            trainer.max_epochs,
-            loss,
-            percent(values.get("val/drift")),
-            values["val/distance_mae_m"],
-            values["val/heading_mae_deg"],
-            self.seconds,
-            waited,
-        )
+        epoch = f"epoch {trainer.current_epoch + 1:2d}/{trainer.max_epochs}"
+        log.info("%s  loss %.4f  validation: %s  %4.0f s%s", epoch, loss, shown, self.seconds, waited)
 
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
         """Keeps the clock and the means so far."""
-        sums, windows = self._of_all_processes(trainer)
+        sums, windows = self._sums_of_all_processes(trainer)
         seconds = time.monotonic() - self._begun
         checkpoint["training_log"] = {"seconds": seconds, "sums": sums, "windows": windows}
 

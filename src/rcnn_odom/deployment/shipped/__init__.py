@@ -7,12 +7,12 @@ from rcnn_odom.errors import InputError
 FOLDER = Path(__file__).parent
 
 
-def shipped() -> list[str]:
+def shipped_models() -> list[str]:
     """Names of the models."""
     return sorted(path.stem for path in FOLDER.glob("*.onnx"))
 
 
-def find_model(path: str | Path) -> Path:
+def find_file(path: str | Path) -> Path:
     """A file by its path, or a model that ships with the project by its name.
 
     Raises:
@@ -20,6 +20,7 @@ def find_model(path: str | Path) -> Path:
     """
     if Path(path).is_file():
         return Path(path)
-    if str(path) in shipped():
+    names = shipped_models()
+    if str(path) in names:
         return FOLDER / f"{path}.onnx"
-    raise InputError(f"{path}: no such file, nor a model that ships with rcnn-odom ({', '.join(shipped())})")
+    raise InputError(f"{path}: no such file, nor a model that ships with rcnn-odom ({', '.join(names)})")

@@ -15,18 +15,24 @@ from rcnn_odom.evaluation.sweep_report.comparisons import (
     reference_setting,
     result,
 )
-from rcnn_odom.evaluation.sweep_report.document import image, write_report
-from rcnn_odom.evaluation.sweep_report.figure_sections import curves_section, trajectories_section
-from rcnn_odom.evaluation.sweep_report.overview import opening, origin_section, runs_section
-from rcnn_odom.evaluation.sweep_report.plots import drift_figure, png
+from rcnn_odom.evaluation.sweep_report.document import image, text_table, write_report
+from rcnn_odom.evaluation.sweep_report.figures import (
+    curves_section,
+    drift_figure,
+    png,
+    trajectories_section,
+)
 from rcnn_odom.evaluation.sweep_report.runs_table import read_sweep, runs_table
-from rcnn_odom.evaluation.sweep_report.score_sections import (
+from rcnn_odom.evaluation.sweep_report.sections import (
     drift_section,
     drift_table,
-    frame_section,
+    metrics_section,
+    metrics_table,
+    opening,
+    origin_section,
     paper_section,
+    runs_section,
 )
-from rcnn_odom.evaluation.sweep_report.tables import text_table
 
 
 @dataclass(frozen=True)
@@ -36,7 +42,7 @@ class Written:
     Attributes:
         markdown: path of ``report.md``.
         html: path of ``report.html``.
-        table: the comparison table for a terminal.
+        table: of drift and of the other metrics, for a terminal.
         unfinished: runs that are not finished, missing ones included.
         content: ``runs``, the rows of ``load_runs``, and ``comparisons``, ready for JSON.
     """
@@ -48,19 +54,25 @@ class Written:
     content: dict[str, Any]
 
 
-def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequence[str] = ()) -> Written:
+def make_report(
+    directory: str | Path,
+    only: Sequence[str] = (),
+    reference: Sequence[str] = (),
+    expected: Sequence[str] | None = None,
+) -> Written:
     """Writes ``report.md``, ``report.html`` and ``report_figures`` into a folder of runs.
 
     Args:
         directory: a sweep's folder, or any around runs.
         only: ``KEY=VALUE`` of options that a run must have to be in the report.
         reference: ``KEY=VALUE`` that single out the setting to compare the others with.
+        expected: names of the folders that the folder's last command asked for; None where not known.
 
     Raises:
         InputError: no such folder, no run in it, none of them finished, runs on different data, no such
             reference, or a file in the way that is no earlier report.
     """
-    sweep = read_sweep(directory, only)
+    sweep = read_sweep(directory, only, expected)
     if not sweep.finished:
         first = next((run for run in sweep.runs if run.problem), None)
         why = f"; {first.name}: {first.problem}" if first else ""
@@ -76,7 +88,7 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
         drift_section(sweep, image("drift", "mean drift of every run, by setting")),
         difference_section(sweep, chosen, why, comparisons),
         paper_section(sweep),
-        frame_section(sweep),
+        metrics_section(sweep),
         curves_section(sweep, figures),
         trajectories_section(sweep, figures),
         runs_section(sweep, table),
@@ -84,6 +96,7 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
     ]
     text = "\n\n".join(filter(None, parts))
     paths = write_report(sweep.directory, f"Runs in {sweep.directory.resolve().name}", text, figures)
+    tables = "\n\n".join(text_table(*table(sweep)) for table in (drift_table, metrics_table))
     unfinished = len(sweep.runs) - len(sweep.finished) + len(sweep.missing)
     content = {
         "runs": json.loads(table.dropna(axis="columns", how="all").to_json(orient="records")),
@@ -93,4 +106,4 @@ def make_report(directory: str | Path, only: Sequence[str] = (), reference: Sequ
             for one in comparisons
         ],
     }
-    return Written(*paths, text_table(*drift_table(sweep)), unfinished, content)
+    return Written(*paths, tables, unfinished, content)

@@ -6,6 +6,7 @@ from statistics import fmean
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.scores import percent
+from rcnn_odom.evaluation.sweep_report.document import DASH, Row, escape, markdown_table, number
 from rcnn_odom.evaluation.sweep_report.options import Values, parse_choice, show_value
 from rcnn_odom.evaluation.sweep_report.paper import NETWORK
 from rcnn_odom.evaluation.sweep_report.runs_table import Sweep
@@ -17,7 +18,6 @@ from rcnn_odom.evaluation.sweep_report.statistics import (
     paired_ratio,
     verdict,
 )
-from rcnn_odom.evaluation.sweep_report.tables import DASH, Row, escape, markdown_table, number
 
 Drifts = dict[Values, dict[int, float]]
 """Ratios by setting and seed."""
@@ -106,7 +106,7 @@ def compare(drifts: Mapping[Values, Mapping[int, float]], reference: Values) -> 
 
 
 def result(sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]) -> str:
-    """The outcome in some sentences; what is best is told by validation, never by the test sequences."""
+    """The outcome in some sentences; what is best is decided by validation, never by the test sequences."""
     if not comparisons:
         return "There is one setting, and nothing to compare it with."
     validation, test = drifts_by_setting(sweep, "val_drift"), drifts_by_setting(sweep)

@@ -1,14 +1,25 @@
-"""A report as files: Markdown with its figures beside it, and HTML in one file."""
+"""A report as files, Markdown with its figures beside it and HTML in one, and tables and text in them."""
 
 import base64
 import html
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.sweep_report.plots import MARK
+from rcnn_odom.evaluation.scores import aligned
+from rcnn_odom.files import write_atomically
 
 MARKDOWN, HTML, FIGURES = "report.md", "report.html", "report_figures"
+MARK = "rcnn-odom report"
+"""Written into every file of a report, by which it is known as one."""
+
+Row = Sequence[str]
+DASH = "-"
+
+_PLAIN = re.compile(r"[\w.,=:/+@%()\[\] -]+")
+_SPECIAL = re.compile(r"[&<>\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])")
+"""What Markdown or HTML would take for markup; an underscore within a word is none."""
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f23; --paper: #ffffff; --line: #d5d9de; --soft: #f4f6f8;
@@ -59,9 +70,8 @@ def write_report(directory: Path, title: str, text: str, figures: Mapping[str, b
     contents[HTML] = to_html(title, text, figures).encode()
     for name in contents:
         _need_own(directory / name)
-    (directory / FIGURES).mkdir(exist_ok=True)
     for name, content in contents.items():
-        _write(directory / name, content)
+        write_atomically(directory / name, content)
     return directory / MARKDOWN, directory / HTML
 
 
@@ -88,7 +98,51 @@ def _need_own(path: Path) -> None:
         raise InputError(f"{path}: was not written by rcnn-odom report; move it away, then try again")
 
 
-def _write(path: Path, content: bytes) -> None:
-    partial = path.with_name(f".{path.name}.partial")
-    partial.write_bytes(content)
-    partial.replace(path)
+def escape(text: object) -> str:
+    """Any text so that Markdown and HTML show it as it is, on one line, also in a cell of a table."""
+    line = " ".join(str(text).split())
+    # An entity means the same to all readers, unlike a backslash before a character that needs none.
+    return _SPECIAL.sub(lambda found: f"&#{ord(found[0])};", line)
+
+
+def code(text: object) -> str:
+    """A name or a command as code; escaped text where it holds what could end the code."""
+    return f"`{text}`" if _PLAIN.fullmatch(str(text)) and str(text).strip() == str(text) else escape(text)
+
+
+def markdown_table(header: Row, rows: Sequence[Row], words: int = 1, names: Row = ()) -> str:
+    """A table in Markdown; the first ``words`` columns to the left, numbers after them to the right.
+
+    Args:
+        header: of the columns, plain text.
+        rows: cells, plain text.
+        words: how many columns hold words.
+        names: headings of columns that hold names, which are shown as code.
+    """
+    show = [code if name in names else escape for name in header]
+    body = [
+        [DASH if text == DASH else render(text) for render, text in zip(show, row, strict=True)]
+        for row in rows
+    ]
+    rule = ["---" if column < words else "---:" for column in range(len(header))]
+    return "\n".join(f"| {' | '.join(line)} |" for line in [list(map(escape, header)), rule, *body])
+
+
+def text_table(header: Row, rows: Sequence[Row]) -> str:
+    """The same for a terminal."""
+    return aligned([[" ".join(cell.split()) for cell in row] for row in (header, *rows)])
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number with so many decimals; a dash for None and nan."""
+    return DASH if value is None or value != value else f"{value:.{digits}f}"
+
+
+def duration(seconds: float | None) -> str:
+    """A time for people."""
+    if seconds is None or seconds != seconds:
+        return DASH
+    minutes, rest = divmod(round(seconds), 60)
+    if minutes < 1:
+        return f"{rest} s"
+    return f"{minutes} min {rest:02d} s" if minutes < 60 else f"{minutes // 60} h {minutes % 60:02d} min"

@@ -140,7 +140,7 @@ def choose(runs: Sequence[Run], only: Iterable[str]) -> list[Run]:
 
 
 def parse_choice(text: str) -> tuple[str, str]:
-    """``KEY=VALUE`` as its two parts; a group's name stands for the value that tells its choice.
+    """``KEY=VALUE`` as its two parts; a group's name stands for the value that names its choice.
 
     Raises:
         InputError: the text has another form.

@@ -1,6 +1,5 @@
 """The table of a sweep's runs."""
 
-import json
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -8,7 +7,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.sweep_report.folders import METRICS, Run, find_runs
+from rcnn_odom.evaluation.metrics import all_metrics
+from rcnn_odom.evaluation.sweep_report.folders import Run, find_runs, first_stage_seconds
 from rcnn_odom.evaluation.sweep_report.options import (
     Values,
     check_same_data,
@@ -20,18 +20,9 @@ from rcnn_odom.evaluation.sweep_report.options import (
     value_of,
 )
 from rcnn_odom.evaluation.sweep_report.paper import VARIANTS
-from rcnn_odom.training.sweep import expected_folders
 
 if TYPE_CHECKING:
     import pandas as pd
-
-SCORES = (
-    *("floor", "val_drift", "rotation_deg_per_m"),
-    *("distance_mae_m", "distance_bias_m", "distance_max_m"),
-    *("heading_mae_deg", "heading_bias_deg", "heading_max_deg"),
-    *("latency_ms", "seconds", "first_stage_seconds"),
-)
-"""Columns of numbers, after those of the drift."""
 
 MISSING = "the last command for this folder asked for it, and there is no such folder"
 """What is wrong with a missing run; what earlier commands asked for is not known."""
@@ -109,12 +100,15 @@ def _by_value(settings: Iterable[Values]) -> list[Values]:
     return sorted(come, key=order)
 
 
-def read_sweep(directory: str | Path, only: Sequence[str] = ()) -> Sweep:
+def read_sweep(
+    directory: str | Path, only: Sequence[str] = (), expected: Sequence[str] | None = None
+) -> Sweep:
     """Reads the runs below a folder, which need not come from one sweep.
 
     Args:
         directory: a sweep's folder, or any around runs.
         only: ``KEY=VALUE`` of options that a run must have to be taken, with their full names.
+        expected: names of the folders that the folder's last command asked for; None where not known.
 
     Raises:
         InputError: no such folder, no run in it, or runs on different data, which no table can hold.
@@ -129,7 +123,7 @@ def read_sweep(directory: str | Path, only: Sequence[str] = ()) -> Sweep:
             f"{directory}: no run in it{only_scores}; train some, for instance python train.py -m seed=0,1,2"
         )
     folders = {run.name for run in everything}
-    missing = [name for name in expected_folders(directory) or [] if name not in folders]
+    missing = [name for name in expected or () if name not in folders]
     options = swept_options([run for run in runs if run.settings])
     finished = [run for run in runs if run.status == "finished"]
     check_same_data(finished, options)
@@ -139,10 +133,12 @@ def read_sweep(directory: str | Path, only: Sequence[str] = ()) -> Sweep:
     return Sweep(directory, runs, missing, same, left_out, options)
 
 
-def load_runs(directory: str | Path, only: Sequence[str] = ()) -> "pd.DataFrame":
+def load_runs(
+    directory: str | Path, only: Sequence[str] = (), expected: Sequence[str] | None = None
+) -> "pd.DataFrame":
     """The runs below a folder as a table, one row a run, finished or not.
 
-    Columns, empty (None or nan) where a run does not tell:
+    Columns, empty (None or nan) where that is not known:
 
     - ``run``: its path below the folder; ``status``: ``finished``, ``unfinished``, ``failed``, ``damaged``,
       or ``missing`` (the folder's last command asked for it, and it is not there); ``problem``: why it is
@@ -151,10 +147,9 @@ def load_runs(directory: str | Path, only: Sequence[str] = ()) -> "pd.DataFrame"
     - a column for each swept option under its full name (``model.kernel_size``); lists as tuples.
       ``attrs["options"]`` of the table names them.
     - ``drift``: mean over the test sequences, a ratio; ``drift_NAME`` of each; ``floor`` of two-number
-      motion; ``val_drift`` of validation; ``rotation_deg_per_m``: mean over the test sequences.
-    - ``distance_mae_m``, ``distance_bias_m``, ``heading_mae_deg``, ``heading_bias_deg``: mean absolute and
-      mean signed error of a frame, over all motions of the test sequences; ``distance_max_m``,
-      ``heading_max_deg``: the largest.
+      motion; ``val_drift`` of validation.
+    - every other metric over all test sequences, under its name (see
+      :func:`rcnn_odom.evaluation.metrics.all_metrics`): ``rotation_deg_per_m``, ``distance_mae_m`` ...
     - ``latency_ms``: median time of a frame; ``seconds``: of training; ``first_stage_seconds``: of
       training a recurrent network's first stage, where that was done within the run.
     - ``same_as``: the run that did the same training before, and gave its weights.
@@ -165,11 +160,13 @@ def load_runs(directory: str | Path, only: Sequence[str] = ()) -> "pd.DataFrame"
     Args:
         directory: a sweep's folder, or any around runs, for instance ``outputs``.
         only: ``KEY=VALUE`` of options that a run must have to be in the table.
+        expected: names of the folders that should be there, for the status ``missing``; for a sweep's folder
+            :func:`rcnn_odom.training.sweep.expected_folders` knows them.
 
     Raises:
         InputError: no such folder, no run in it, or runs on different data.
     """
-    return runs_table(read_sweep(directory, only))
+    return runs_table(read_sweep(directory, only, expected))
 
 
 def runs_table(sweep: Sweep) -> "pd.DataFrame":
@@ -178,7 +175,9 @@ def runs_table(sweep: Sweep) -> "pd.DataFrame":
 
     rows = [_row(sweep, run) for run in sweep.runs]
     rows += [{"run": name, "status": "missing", "problem": MISSING} for name in sweep.missing]
-    numbers = ["drift", *(f"drift_{name}" for name in sweep.sequences), *SCORES]
+    numbers = ["drift", *(f"drift_{name}" for name in sweep.sequences), "floor", "val_drift"]
+    numbers += [name for name in all_metrics() if name != "drift"]
+    numbers += ["latency_ms", "seconds", "first_stage_seconds"]
     columns = ["run", "status", "problem", "variant", "seed", "data", *sweep.options]
     columns += [*numbers, "same_as", "repeats"]
     table = pd.DataFrame(rows, columns=columns)
@@ -195,15 +194,7 @@ def _row(sweep: Sweep, run: Run) -> dict[str, Any]:
         for column, option in (("variant", "model.variant"), ("data", "data.name"), ("seed", "seed")):
             row[column] = run.settings.get(option)
         if run.status == "finished":
-            row |= run.metrics.scores | {"first_stage_seconds": _first_stage_seconds(run)}
+            row |= run.metrics.scores | {"first_stage_seconds": first_stage_seconds(run)}
             counted = sweep.by_setting[setting][run.settings["seed"]]
             row["repeats"] = None if counted is run else counted.name
     return row
-
-
-def _first_stage_seconds(run: Run) -> float | None:
-    try:
-        seconds = json.loads((run.folder / "first_stage" / METRICS).read_text())["training"]["seconds"]
-        return float(seconds)
-    except (OSError, ValueError, KeyError, TypeError):
-        return None

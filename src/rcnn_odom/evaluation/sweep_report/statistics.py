@@ -10,6 +10,10 @@ LEVEL = 0.95
 
 NO_DIFFERENCE = "no difference shown"
 
+NO_SCATTER = "seeds do not scatter: nothing can be tested"
+SCATTER = 1e-9
+"""Differences of logarithms that are closer than this are equal but for rounding."""
+
 
 def mean_sd(values: Sequence[float]) -> tuple[float | None, float | None]:
     """Mean and sample standard deviation (divisor n-1); None for what so few values do not have."""
@@ -25,9 +29,10 @@ class Ratio:
         seeds: how many these are.
         ratio: geometric mean of the seeds' ratios; below 1 the first setting drifts less. None without a
             seed in common.
-        low: lower end of its interval at ``LEVEL``; None with fewer than two seeds.
+        low: lower end of its interval at ``LEVEL``; None where nothing can be tested: with fewer than two
+            seeds, or where all seeds have the same ratio, other than 1.
         high: its upper end.
-        p: of the hypothesis that the ratio is 1, two-sided; None with fewer than two seeds.
+        p: of the hypothesis that the ratio is 1, two-sided; None as there.
     """
 
     seeds: int
@@ -62,8 +67,9 @@ def paired_ratio(first: Mapping[int, float], second: Mapping[int, float]) -> Rat
     ratio = float(np.exp(difference.mean()))
     if len(common) < 2:
         return Ratio(1, ratio)
-    if not np.ptp(difference):  # no scatter at all, for which t is not defined
-        return Ratio(len(common), ratio, ratio, ratio, 0.0 if difference[0] else 1.0)
+    if np.ptp(difference) < SCATTER:  # for which t is not defined
+        same = np.abs(difference).max() < SCATTER
+        return Ratio(len(common), 1.0, 1.0, 1.0, 1.0) if same else Ratio(len(common), ratio)
     test = ttest_rel(logs[0], logs[1])
     low, high = np.exp(test.confidence_interval(LEVEL))
     return Ratio(len(common), ratio, float(low), float(high), float(test.pvalue))
@@ -91,7 +97,8 @@ def holm(p_values: Sequence[float | None]) -> list[float | None]:
 def verdict(ratio: Ratio, adjusted_p: float | None) -> str:
     """What a comparison shows, in words: decided by the adjusted p value, not by the interval."""
     if adjusted_p is None or ratio.ratio is None:
-        return "one seed: nothing can be said" if ratio.seeds else "no seed in common: nothing can be said"
+        few = ("no seed in common: nothing can be said", "one seed: nothing can be said")
+        return few[ratio.seeds] if ratio.seeds < 2 else NO_SCATTER
     if adjusted_p >= 1 - LEVEL:
         return NO_DIFFERENCE
     return "lower drift" if ratio.ratio < 1 else "higher drift"

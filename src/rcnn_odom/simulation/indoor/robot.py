@@ -11,6 +11,8 @@ from rcnn_odom.simulation.indoor.building import Building
 from rcnn_odom.simulation.indoor.floor import CELL, ROOM_TO_DRIVE, Floor
 from rcnn_odom.simulation.street.polyline import arc_length, resample, unit
 
+SPEED = 0.5
+"""Metres a second of the three robots when they drive straight on."""
 LASER_AHEAD = 0.08
 """Metres between the middle of a robot and its laser, at most."""
 
@@ -35,6 +37,11 @@ class Robot:
     errand: float
     laser_ahead: float
 
+    @property
+    def period(self) -> float:
+        """Seconds between two scans."""
+        return self.step / SPEED
+
 
 def random_robot(rng: np.random.Generator) -> Robot:
     """A robot of about half a metre and 45 degrees a second, whose laser scans twice to 12 times a second."""
@@ -51,7 +58,7 @@ def random_robot(rng: np.random.Generator) -> Robot:
     )
 
 
-def random_walk(building: Building, frames: int, rng: np.random.Generator) -> FloatArray:
+def random_walk(building: Building, frames: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
     """A robot's errands through a building.
 
     Args:
@@ -60,14 +67,16 @@ def random_walk(building: Building, frames: int, rng: np.random.Generator) -> Fl
         rng: where all chance comes from.
 
     Returns:
-        x, y and heading of the laser in every frame, (N, 3), metres and radians (not wrapped).
+        x, y and heading of the laser in every frame, (N, 3), metres and radians (not wrapped), and the
+        frames' stamps (N,) in seconds, the first 0.
     """
     robot = random_robot(rng)
     ways = Ways.of(building.floor, rng)
     course = np.array([[*ways.anywhere(rng), rng.uniform(-np.pi, np.pi)]])
     waits = np.array([rng.exponential(5)])
     clock = _frames_needed(course, waits, robot)
-    instants = np.cumsum(_intervals(frames, rng))
+    pace, intervals = _paces_and_intervals(frames, rng)
+    instants = np.cumsum(pace * intervals)
     while clock[-1, 1] < instants[-1]:
         path = ways.way(course[-1, :2], robot.errand, rng)
         ahead = _follow(path, course[-1], building.floor, robot, rng)
@@ -78,7 +87,8 @@ def random_walk(building: Building, frames: int, rng: np.random.Generator) -> Fl
     x, y, heading = (np.interp(instants, clock.ravel(), np.repeat(column, 2)) for column in course.T)
     heading += _unsteady(frames, rng)
     middle = np.stack([x, y], axis=1)
-    return np.column_stack([middle + robot.laser_ahead * unit(heading), heading])
+    stamps = robot.period * (np.cumsum(intervals) - intervals[0])
+    return np.column_stack([middle + robot.laser_ahead * unit(heading), heading]), stamps
 
 
 @dataclass(frozen=True)
@@ -202,14 +212,14 @@ def _frames_needed(course: FloatArray, waits: FloatArray, robot: Robot) -> Float
     return np.stack([arrival, arrival + waits], axis=1)
 
 
-def _intervals(frames: int, rng: np.random.Generator) -> FloatArray:
-    """Time between scans, 1 on average: robots' speeds drift, clocks stutter and scans get lost."""
+def _paces_and_intervals(frames: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+    """Robots' speeds drift, clocks stutter and scans get lost: speed and time between scans, both about 1."""
     drift = ndimage.gaussian_filter1d(rng.normal(size=frames), 10, mode="wrap") * np.sqrt(
         2 * np.sqrt(np.pi) * 10
     )
     stutter = np.clip(rng.normal(0, 0.12, frames), -0.5, 0.5)
     lost = rng.random(frames) < 0.01
-    return np.exp(0.12 * drift) * (1 + stutter) * (1 + lost)
+    return np.exp(0.12 * drift), (1 + stutter) * (1 + lost)
 
 
 def _unsteady(frames: int, rng: np.random.Generator) -> FloatArray:

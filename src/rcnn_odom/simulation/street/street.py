@@ -14,7 +14,7 @@ from scipy.spatial import cKDTree
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Material, Walls
 from rcnn_odom.simulation.street.city import COUNTRY, MAIN, RESIDENTIAL, Plan, Roads, Warp
-from rcnn_odom.simulation.street.terrain import Ground
+from rcnn_odom.simulation.terrain import Ground
 
 SIGHT = 90.0
 """Metres from the driven line within which blocks are drawn: a little more than the laser sees."""

@@ -14,7 +14,7 @@ from rcnn_odom.simulation.street.line import PATH_STEP
 from rcnn_odom.simulation.street.polyline import resample
 from rcnn_odom.simulation.street.speed import FRAME_TIME
 from rcnn_odom.simulation.street.street import BELOW_GROUND, PAINT, car_outline, car_size, rectangle
-from rcnn_odom.simulation.street.terrain import Ground
+from rcnn_odom.simulation.terrain import Ground
 
 SEEN = 85.0
 """Metres from the laser within which movers are kept: a little more than it sees."""

@@ -2,17 +2,18 @@
 
 import numpy as np
 import pytest
-
-from conftest import SHARED
-from rcnn_odom.comparison.scans import (
+from compare_simulation import (
     change_figures,
     empty_runs,
     real_figures,
     scan_figures,
     simulated_figures,
 )
+
+from conftest import SHARED
 from rcnn_odom.geometry import planar_to_poses
-from rcnn_odom.recordings.recording import Sequence
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.scan import Scan
 
 KITTI = SHARED / "data" / "kitti"
 
@@ -58,12 +59,12 @@ def test_undone_motion_leaves_nothing_of_a_still_world() -> None:
     angles = np.deg2rad(np.arange(-1800, 1800) * 0.1)
     ranges = 20 + 5 * np.sin(3 * angles)
 
-    def read_scan(frame: int) -> tuple[np.ndarray, np.ndarray]:
-        return angles - frame * turn, ranges
+    def read_scan(frame: int) -> Scan:
+        return Scan(ranges, angles - frame * turn)
 
-    def sequence(turns: list[float]) -> Sequence:
+    def sequence(turns: list[float]) -> Recording:
         poses = planar_to_poses([(0, 0, heading) for heading in turns])
-        return Sequence("round", poses, np.arange(2.0), read_scan, "")
+        return Recording("round", poses, np.arange(2.0), read_scan, "")
 
     right = change_figures(sequence([0, turn]), [0])
     wrong = change_figures(sequence([0, 0]), [0])

@@ -2,12 +2,12 @@
 
 import pytest
 
-from rcnn_odom.deployment.sampling import Thinned
+from rcnn_odom.deployment.sampling import EvenSample
 
 
 @pytest.mark.parametrize("count", [0, 1, 7, 8, 9, 16, 17, 1000])
 def test_items_are_evenly_spaced_and_never_too_many(count):
-    sample = Thinned(8)
+    sample = EvenSample(8)
     for item in range(count):
         sample.add(lambda item=item: item)
     assert len(sample.items) <= 8

@@ -2,6 +2,7 @@
 
 import json
 import re
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from conftest import SHARED
 from rcnn_odom.cli import main
 from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.onnx_model import OnnxStepper
-from rcnn_odom.deployment.shipped import FOLDER, find_model, shipped
+from rcnn_odom.deployment.shipped import FOLDER, find_file, shipped_models
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import drift
 from rcnn_odom.geometry import change_frame
@@ -21,16 +22,16 @@ REAL = SHARED / "data" / "kitti"
 
 
 def test_it_is_small_and_told_of():
-    assert shipped() == ["rcnn_small"]
-    assert find_model("rcnn_small").stat().st_size < 10e6
-    stepper = OnnxStepper(find_model("rcnn_small"))
+    assert shipped_models() == ["rcnn_small"]
+    assert find_file("rcnn_small").stat().st_size < 10e6
+    stepper = OnnxStepper(find_file("rcnn_small"))
     assert stepper.metadata["precision"] == "int8"
     assert stepper.description.sensor == Sensor()
     card = (FOLDER / "rcnn_small.md").read_text()
     mean = stepper.metadata["drift"]["mean"]
     assert f"{100 * mean:.2f} %" in card, "the card tells the drift that the file does"
     with pytest.raises(InputError, match=r"nor a model that ships with rcnn-odom \(rcnn_small\)"):
-        find_model("rcnn_large")
+        find_file("rcnn_large")
 
 
 def test_it_estimates_simulated_streets():
@@ -39,8 +40,7 @@ def test_it_estimates_simulated_streets():
     odometer = Odometer.from_onnx("rcnn_small")
     poses = []
     for frame in range(150):
-        angles, ranges = sequence.read_scan(frame)
-        pose = odometer.step(ranges, float(sequence.stamps[frame]), angles)
+        pose = odometer.step(replace(sequence.read_scan(frame), stamp=float(sequence.stamps[frame])))
         assert pose.degraded == ""
         poses.append(pose.matrix())
     estimate, truth = (

@@ -1,1 +1,0 @@
-"""Tables of how like the real recordings the simulated drives are."""

@@ -1,0 +1,202 @@
+"""The report's figures, and the sections that are made of them."""
+
+import io
+from collections.abc import Mapping, Sequence
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.figures import draw_trajectory
+from rcnn_odom.evaluation.scores import percent
+from rcnn_odom.evaluation.sweep_report.document import MARK, code, escape, image
+from rcnn_odom.evaluation.sweep_report.folders import Run
+from rcnn_odom.evaluation.sweep_report.runs_table import Sweep
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings.trajectory import file_name, flatten, read_kitti
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00")
+"""Okabe and Ito's, which people with any colour vision tell apart; without yellow, pale on white."""
+MARKERS = "osD^vPX*"
+
+MOST_BANDS = 4
+"""Settings up to which their scatter is drawn; of more the bands would hide each other."""
+
+LEAST_SEGMENTS = 3
+"""Fewer make no point of a curve, as in KITTI's devkit."""
+
+
+def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
+    """Drift against the length of a segment; adds the figure. Empty where no run has enough segments."""
+    curves = {
+        sweep.label(setting): [curve for run in runs.values() if len(curve := length_curve(run))]
+        for setting, runs in sweep.by_setting.items()
+    }
+    curves = {label: runs for label, runs in curves.items() if runs}
+    if not curves:
+        return ""
+    figures["length"] = png(curves_figure(curves))
+    return "\n\n".join(
+        [
+            "## Drift against length",
+            image("length", "translation and rotation error against the length of the segment"),
+            "Means over all segments, whatever sequence they are of. A line is the mean over seeds; a band, "
+            f"drawn for up to {MOST_BANDS} settings, reaches from the lowest to the highest seed. "
+            f"{LEAST_SEGMENTS} segments at least make a point.",
+        ]
+    )
+
+
+def length_curve(run: Run) -> FloatArray:
+    """Rows of length in metres, translation error in percent, rotation error in degrees per metre, (P, 3)."""
+    rows = [
+        (length, 100 * t_err, r_err)
+        for length, (segments, t_err, r_err) in sorted(run.metrics.by_length.items())
+        if segments >= LEAST_SEGMENTS
+    ]
+    return np.array(rows).reshape(-1, 3)
+
+
+def trajectories_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
+    """Trajectories of one run of each setting; adds the figures."""
+    lines = []
+    for place, (setting, runs) in enumerate(sweep.by_setting.items(), start=1):
+        if not runs:
+            continue
+        run = middle_run(list(runs.values()))
+        drift = percent(run.metrics.scores["drift"])
+        title = f"{sweep.label(setting)}, seed {run.settings['seed']}, mean drift {drift} %"
+        try:
+            panels = {
+                f"{name}: drift {percent(run.metrics.scores[f'drift_{name}'])} %": trajectory(run, name)
+                for name in run.metrics.sequences
+            }
+        except InputError as error:
+            lines.append(f"Not drawn, {code(run.name)}: {escape(error)}")
+            continue
+        figures[f"trajectories_{place}"] = png(trajectories_figure(title, panels))
+        lines.append(f"{escape(title)} ({code(run.name)}):")
+        lines.append(image(f"trajectories_{place}", "trajectories over the truth, seen from above"))
+    words = "Of each setting the run of median validation drift, so that no test drift chooses what is shown."
+    return "\n\n".join(["## Trajectories", words, *lines]) if lines else ""
+
+
+def middle_run(runs: Sequence[Run]) -> Run:
+    """The run of median validation drift, of two in the middle the better; runs without one come last."""
+
+    def order(run: Run) -> float:
+        drift = run.metrics.scores["val_drift"]
+        return np.inf if drift is None else drift
+
+    known = [run for run in runs if np.isfinite(order(run))]
+    return sorted(known or runs, key=order)[(len(known or runs) - 1) // 2]
+
+
+def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
+    """True and estimated places of a test sequence, (N, 2) metres to the right and ahead of the start.
+
+    Raises:
+        InputError: a file is not there or not a trajectory.
+    """
+    folder, name = run.folder / "trajectories", file_name(sequence)
+    truth, estimate = (flatten(read_kitti(folder / file)) for file in (f"{name}_truth.txt", f"{name}.txt"))
+    return _from_start(truth), _from_start(estimate)
+
+
+def _from_start(camera_poses: FloatArray) -> FloatArray:
+    places: FloatArray = (np.linalg.inv(camera_poses[0]) @ camera_poses)[:, [0, 2], 3]
+    return places
+
+
+def png(figure: "Figure") -> bytes:
+    """A figure as the content of a PNG file."""
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", dpi=120, metadata={"Software": MARK})
+    return buffer.getvalue()
+
+
+def drift_figure(drifts: Mapping[str, Mapping[int, float]]) -> "Figure":
+    """The mean test drift of every run, and of each setting the mean.
+
+    Args:
+        drifts: ratio by seed, by the label of the setting; settings without a run show nothing.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8, 1.4 + 0.45 * len(drifts)), layout="constrained")
+    axes = figure.subplots()
+    seeds = sorted({seed for runs in drifts.values() for seed in runs})
+    for place, runs in enumerate(drifts.values()):
+        if runs:
+            mean = 100 * np.mean(list(runs.values()))
+            axes.plot([mean, mean], [place - 0.3, place + 0.3], color="black", linewidth=2.5, zorder=1)
+    for index, seed in enumerate(seeds):
+        points = [(100 * runs[seed], place) for place, runs in enumerate(drifts.values()) if seed in runs]
+        axes.plot(*zip(*points, strict=True), linestyle="", label=f"seed {seed}", alpha=0.85, **_style(index))
+    axes.plot([], [], color="black", linewidth=2.5, label="mean")
+    axes.set(xlabel="mean drift of the test sequences (%)", ylim=(len(drifts) - 0.5, -0.5))
+    axes.set_yticks(range(len(drifts)), list(map(_plain, drifts)))
+    axes.set_xlim(left=0)
+    axes.grid(axis="x", alpha=0.3)
+    axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
+    return figure
+
+
+def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
+    """Translation and rotation error against the length of a segment, a line for each setting.
+
+    Args:
+        curves: of the seeds, each of :func:`length_curve`, by the label of the setting.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(11, 4.4 + 0.18 * max(0, len(curves) - 3)), layout="constrained")
+    panels = list(figure.subplots(1, 2))
+    for index, (label, runs) in enumerate(curves.items()):
+        rows = np.concatenate(runs)
+        lengths = np.unique(rows[:, 0])
+        for column, axes in enumerate(panels, start=1):
+            seeds = [rows[rows[:, 0] == length, column] for length in lengths]
+            axes.plot(lengths, list(map(np.mean, seeds)), label=_plain(label), linewidth=1.6, **_style(index))
+            if len(curves) <= MOST_BANDS:
+                low, high = list(map(np.min, seeds)), list(map(np.max, seeds))
+                axes.fill_between(lengths, low, high, color=_style(index)["color"], alpha=0.13, linewidth=0)
+    for axes, name in zip(
+        panels, ("translation error (%)", "rotation error (degrees per metre)"), strict=True
+    ):
+        axes.set(xlabel="length of the segment (m)", ylabel=name)
+        axes.grid(alpha=0.3)
+        axes.set_ylim(bottom=0)
+    columns = 1 if max(map(len, curves)) > 40 else min(len(curves), 4)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
+    return figure
+
+
+def trajectories_figure(title: str, panels: Mapping[str, tuple[FloatArray, FloatArray]]) -> "Figure":
+    """Trajectories of one run over the truth, a panel for each sequence.
+
+    Args:
+        title: above all of them.
+        panels: true and estimated places, see :func:`trajectory`, by the panel's title.
+    """
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(max(4.6 * len(panels), 7), 4.6), layout="constrained")
+    figure.suptitle(_plain(title), fontweight="bold")
+    axes = figure.subplots(1, len(panels), squeeze=False)[0]
+    for one, (name, pair) in zip(axes, panels.items(), strict=True):
+        draw_trajectory(one, _plain(name), *pair)
+    return figure
+
+
+def _plain(text: str) -> str:
+    """Text in which a dollar sign begins no formula."""
+    return text.replace("$", r"\$")
+
+
+def _style(index: int) -> dict[str, Any]:
+    """Colours and markers with numbers of elements that share no divisor, so that few pairs repeat."""
+    return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}

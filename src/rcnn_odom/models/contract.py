@@ -1,0 +1,129 @@
+"""What every estimator is: scans in, steps out; trained or not. Needs numpy alone.
+
+A model is one file in this package and one in ``conf/model``; docs/extending.md writes one.
+"""
+
+import inspect
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import Step, Steps
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.registry import choose, collect, modules_in
+
+
+@dataclass(frozen=True)
+class Description:
+    """What an odometer has to know of its model.
+
+    Attributes:
+        sensor: the laser as the model sees it: how scans are encoded for it.
+        typical_step: root mean square of the training steps' x, y (metres) and heading (radians): how wrong
+            a step may be that is not known at all. nan if unknown.
+        least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
+        period: usual seconds between scans in training; nan if unknown.
+    """
+
+    sensor: Sensor
+    typical_step: tuple[float, float, float] = (np.nan, np.nan, np.nan)
+    least_filled: float = np.nan
+    period: float = np.nan
+
+
+class Stepper(Protocol):
+    """A model in a stream: it estimates one step after the other and carries its own state."""
+
+    description: Description
+
+    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
+        """The step between two encoded scans (2, bins), the earlier first."""
+
+    def reset(self) -> None:
+        """Forgets all earlier pairs."""
+
+
+class Model(ABC):
+    """An estimator.
+
+    Args:
+        options: those of ``conf/model``, checked against ``Options``.
+        sensor: how scans are encoded for it, ``data.sensor``.
+
+    Attributes:
+        name: by which ``model=NAME`` and checkpoints find it.
+        Options: a dataclass of its options; see :mod:`rcnn_odom.options` for bounds.
+        trains: whether ``train.py`` has something to do; then it is a
+            :class:`rcnn_odom.models.trained.TrainedModel`.
+    """
+
+    name: ClassVar[str]
+    Options: ClassVar[type]
+    trains: ClassVar[bool] = False
+    sensor: Sensor
+
+    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
+        super().__init__()
+        self.options, self.sensor = options, sensor
+
+    @abstractmethod
+    def estimate(self, drive: Drive) -> Steps:
+        """The steps of one whole drive."""
+
+    @abstractmethod
+    def stepper(self) -> Stepper:
+        """The same one pair of scans after the other."""
+
+
+NEEDED = ("name", "Options", "estimate", "stepper")
+NEEDED_TO_TRAIN = ("forward", "loss")
+
+
+def check_model(name: str, model: Any) -> None:
+    """Looks whether a class is a model.
+
+    Raises:
+        InputError: a part of the contract is missing; the message says which.
+    """
+    needed = NEEDED + (NEEDED_TO_TRAIN if getattr(model, "trains", False) else ())
+    abstract = getattr(model, "__abstractmethods__", ())
+    missing = [part for part in needed if not hasattr(model, part) or part in abstract]
+    if missing or not (inspect.isclass(model) and issubclass(model, Model)):
+        what = f"lacks {', '.join(missing)}" if missing else f"is no subclass of {Model.__name__}"
+        raise InputError(f"model {name}: {what}; docs/extending.md says what a model has")
+    if model.name != name:
+        raise InputError(f"model {name}: its class is named {model.name}; both must be the same")
+
+
+def all_models() -> dict[str, type[Model]]:
+    """Every model by its name; imports all of them, and so torch.
+
+    Raises:
+        InputError: two have the same name, or one that a package adds lacks a part.
+    """
+    built_in: dict[str, type[Model]] = {}
+    for module in modules_in("rcnn_odom.models"):
+        for member in vars(module).values():
+            own = (
+                inspect.isclass(member) and issubclass(member, Model) and member.__module__ == module.__name__
+            )
+            if own and "name" in vars(member):
+                if member.name in built_in:
+                    raise InputError(f"two models are called {member.name}; rename that of {module.__name__}")
+                built_in[member.name] = member
+    return collect("model", built_in, check_model)
+
+
+def find_model(name: str) -> type[Model]:
+    """The model of this name.
+
+    Raises:
+        InputError: there is none, or as :func:`all_models`.
+    """
+    found: type[Model] = choose("model", name, all_models())
+    return found

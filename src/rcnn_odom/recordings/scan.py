@@ -1,0 +1,59 @@
+"""What flows in: one revolution of a 2D laser."""
+
+from dataclasses import dataclass
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.geometry import FloatArray
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """One revolution of a 2D laser, as the laser gave it: nothing is resampled or cut.
+
+    Attributes:
+        ranges: (P,) metres. What is not positive or not finite is no return.
+        bearings: (P,) radians, 0 ahead, counter-clockwise; any part of the circle, in either direction. None
+            where only the sensor's description says them: evenly over its field of view.
+        times: (P,) seconds of the beams after ``stamp``; None: unknown, as if all at once.
+        stamp: seconds; None where the source has no clock.
+        frame_id: name of the laser's frame, empty if unknown.
+        has_all_beams: the beams without a return are there too, so that spacing and extent of the beams can
+            be told; False where only returns are given, as the points of a cloud.
+    """
+
+    ranges: FloatArray
+    bearings: FloatArray | None = None
+    times: FloatArray | None = None
+    stamp: float | None = None
+    frame_id: str = ""
+    has_all_beams: bool = True
+
+    def __post_init__(self) -> None:
+        for values in (self.bearings, self.times):
+            if self.ranges.ndim != 1 or (values is not None and values.shape != self.ranges.shape):
+                raise ValueError(
+                    f"a scan is ranges (P,) with as many bearings and times, not {self.ranges.shape} with "
+                    f"{None if values is None else values.shape}"
+                )
+
+    @classmethod
+    def from_points(cls, points: npt.ArrayLike, stamp: float | None = None, frame_id: str = "") -> "Scan":
+        """The returns of a scan given as points.
+
+        Args:
+            points: (P, 2 or more) metres, x ahead and y to the left.
+            stamp, frame_id: as above.
+
+        Raises:
+            ValueError: another shape.
+
+        >>> Scan.from_points([[0.0, 2.0]]).bearings.round(3)
+        array([1.571])
+        """
+        values = np.asarray(points, dtype=np.float64)
+        if values.ndim != 2 or values.shape[1] < 2:
+            raise ValueError(f"points are (P, 2 or more), not {values.shape}")
+        x, y = values[:, 0], values[:, 1]
+        return cls(np.hypot(x, y), np.arctan2(y, x), None, stamp, frame_id, has_all_beams=False)

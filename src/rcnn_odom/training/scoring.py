@@ -1,0 +1,79 @@
+"""What ``evaluate.py`` does: scores a run's network, or a model that does not train."""
+
+import logging
+import os
+from pathlib import Path
+
+from omegaconf import DictConfig
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.metrics import Report
+from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, Settings, read_settings
+from rcnn_odom.evaluation.run_report import report_drives
+from rcnn_odom.models.constant import mean_step
+from rcnn_odom.models.contract import find_model
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.training.checkpoint import load_module
+from rcnn_odom.training.run_state import write_config, write_json
+from rcnn_odom.training.settings import plain
+from rcnn_odom.training.stages import build_datamodule, build_trainer, score_module
+
+log = logging.getLogger(__name__)
+
+
+def evaluate(cfg: DictConfig) -> Report:
+    """Scores a run's best checkpoint, or a model that does not train; what its ``metrics.json`` holds.
+
+    Args:
+        cfg: the configuration of ``evaluate.py``.
+
+    Raises:
+        InputError: see its message.
+    """
+    variant = cfg.model.variant if cfg.get("model") else None
+    if variant and find_model(variant).trains:
+        raise InputError(
+            f"model={variant}: a trained network is scored by its run, run=outputs/...; leave out model="
+        )
+    if variant and not cfg.get("data"):
+        raise InputError(f"model={variant} needs recordings: add data=simulated, indoor, kitti or carmen")
+    chosen = plain(cfg)
+    settings, metrics = _score_model(chosen) if variant else _score_run(chosen)
+    folder = Path(chosen["run_dir"])
+    write_config(folder, settings)
+    write_json(folder / METRICS, metrics)
+    log.info("all of it is in %s", folder)
+    return metrics
+
+
+def _score_run(chosen: Settings) -> tuple[Settings, Report]:
+    """Settings and metrics of a run's network on its own test drives, or on those of ``data``."""
+    run, folder = Path(chosen["run"]), Path(chosen["run_dir"])
+    settings = read_settings(run)
+    settings |= {key: chosen[key] for key in ("data", "trainer", "outputs") if chosen.get(key)}
+    trainer = build_trainer(settings)
+    module = load_module(run / BEST, sensor=Sensor(**settings["data"]["sensor"]))
+    datamodule = build_datamodule(settings).load(("test",))
+    scores = score_module(module, datamodule, trainer, settings["data"], folder)
+    home = (run / CONFIG).resolve().parent  # `latest` is a folder of links
+    of = {"run": os.path.relpath(home), "variant": module.variant, "data": settings["data"]["name"]}
+    return settings, {**of, **scores}
+
+
+def _score_model(chosen: Settings) -> tuple[Settings, Report]:
+    """Settings and metrics of a model that does not train, on the test drives of ``data``."""
+    data, options = chosen["data"], dict(chosen["model"])
+    variant = options.pop("variant")
+    model = find_model(variant)(options, Sensor(**data["sensor"]))
+    datamodule = build_datamodule(chosen).load(("test",))
+    drives = datamodule.drives["test"]
+    steps = {drive.name: model.estimate(drive) for drive in drives}
+    mean = mean_step(datamodule.open_recording, data["train"])
+    scores = report_drives(variant, steps, mean, model.stepper(), drives, data, Path(chosen["run_dir"]))
+    metrics: Report = {"variant": variant, "data": data["name"], **scores}
+    if failures := getattr(model, "failures", None):  # of a model that counts them
+        each = (f"{count} of {len(steps[name])} on {name}" for name, count in failures.items())
+        log.info("%s: steps that failed, where the last motion goes on: %s", variant, ", ".join(each))
+        metrics["failures"] = failures
+    settings = {key: value for key, value in chosen.items() if key not in ("run", "trainer")}
+    return settings, metrics
