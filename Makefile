@@ -27,7 +27,7 @@ coverage: install
 	$(BIN)/coverage report --skip-covered --sort=cover
 
 fuzz: install
-	$(BIN)/pytest tests/test_fuzz.py --hypothesis-profile=long
+	$(BIN)/pytest tests/recordings/test_fuzz.py --hypothesis-profile=long
 
 bench: install
 	$(BIN)/python -m rcnn_odom.training.bench

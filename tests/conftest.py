@@ -1,9 +1,11 @@
 """Shared pieces of the tests that run whole experiments."""
 
+import random
 import sys
 from pathlib import Path
 
 import hypothesis
+import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 
@@ -54,15 +56,29 @@ def kitti(tmp_path_factory):
     return [f"data.root={root}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
 
 
+@pytest.fixture(autouse=True)
+def seeds():
+    """Whoever draws at random draws the same every time, alone and among other tests."""
+    random.seed(0)
+    np.random.seed(0)  # noqa: NPY002 - of libraries that use it
+    if torch := sys.modules.get("torch"):
+        torch.manual_seed(0)
+
+
 @pytest.fixture
 def configure(tmp_path):
     """A configuration as ``train.py`` gets it, of a size for tests, writing below ``tmp_path``."""
+    return configure_in(tmp_path)
+
+
+def configure_in(folder):
+    """What the fixture ``configure`` is, writing below a folder."""
 
     def configure(*overrides, name="config", run="run"):
         small = [] if name == "evaluate" else SMALL
         if any(f"model={variant}" in overrides for variant in ("rcnn_reg", "rcnn_cls")):
             small = small + SMALL_RECURRENT
-        folders = [f"outputs={tmp_path}/outputs", f"run_dir={tmp_path}/outputs/{run}"]
+        folders = [f"outputs={folder}/outputs", f"run_dir={folder}/outputs/{run}"]
         with initialize_config_dir(str(ROOT / "conf"), version_base="1.3"):
             return compose(name, [*small, *folders, *overrides])
 

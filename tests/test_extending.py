@@ -113,6 +113,7 @@ def test_training_scores_by_the_metric(run):
     assert set(metrics["coverage"]["test"]) >= {"distance", "heading"}  # the network's own covariances
 
 
+@pytest.mark.slow
 def test_evaluating_again_gives_the_same(place, call, run):
     again = place / "outputs" / "again"
     conf = ("--config-dir", place / "my_lasers" / "conf")
@@ -121,6 +122,7 @@ def test_evaluating_again_gives_the_same(place, call, run):
     assert first["metrics"] == pytest.approx(second["metrics"])
 
 
+@pytest.mark.slow
 def test_the_report_has_a_column_for_the_metric(place, call, run):
     call("-m", "rcnn_odom.cli", "report", place / "outputs")
     report = (place / "outputs" / "report.md").read_text()
@@ -131,6 +133,7 @@ def test_the_report_has_a_column_for_the_metric(place, call, run):
     assert "drift" in load_runs(place / "outputs")  # known without the package as well
 
 
+@pytest.mark.slow
 def test_exported_it_runs_on_a_recording_of_the_format(place, call, run):
     call("-m", "rcnn_odom.cli", "export", run)
     out = place / "poses"
@@ -152,8 +155,17 @@ def test_exported_it_runs_on_a_recording_of_the_format(place, call, run):
         (("    def loss(self", "    def cost(self"), "model small_net: lacks loss"),
         (('name = "small_net"', 'name = "smaller_net"'), "its class is named smaller_net"),
         (("import torch\n", "import torch\nimport no_such_package\n"), "cannot be imported"),
+        (
+            ("    class Options(Recipe):", "    class Options:"),
+            "lacks the option batch_size, the option epochs",
+        ),
+        (
+            ("    @dataclass\n    class Options(Recipe):", "    class Options:"),
+            "Options that are no dataclass",
+        ),
     ],
 )
+@pytest.mark.slow
 def test_a_model_without_a_part_is_refused_in_a_line(place, call, run, edit, problem):
     path = place / "my_lasers" / "small_net.py"
     text = path.read_text()
@@ -167,6 +179,7 @@ def test_a_model_without_a_part_is_refused_in_a_line(place, call, run, edit, pro
     assert printed.count("error") == 1
 
 
+@pytest.mark.slow
 def test_two_models_of_one_name_are_refused(place, call, run):
     path = place / "my_lasers" / "my_lasers-1.0.dist-info" / "entry_points.txt"
     text = path.read_text()
@@ -178,6 +191,7 @@ def test_two_models_of_one_name_are_refused(place, call, run):
     assert "two models are called icp" in printed
 
 
+@pytest.mark.slow
 def test_an_option_that_no_group_has_is_refused(place, call, run):
     conf = ("--config-dir", place / "my_lasers" / "conf")
     arguments = [*conf, *OPTIONS, f"data.root={place}/drives"]

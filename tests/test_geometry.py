@@ -15,7 +15,6 @@ from rcnn_odom.geometry import (
     planar_to_poses,
     poses_to_planar,
     relative_steps,
-    step_errors,
     wrap_angle,
 )
 
@@ -47,7 +46,7 @@ def test_composition_equals_products_of_matrices():
         pose = pose @ step
         expected.append(pose)
     np.testing.assert_allclose(compose(steps), expected, atol=1e-10)
-    np.testing.assert_array_equal(Steps.certain_of_nothing(steps).poses(), compose(steps))
+    np.testing.assert_array_equal(Steps.with_unknown_covariance(steps).poses(), compose(steps))
 
 
 def test_one_step_at_a_time_equals_composition():
@@ -70,7 +69,7 @@ def test_steps_do_not_depend_on_the_world():
 
 
 def test_unknown_covariances_are_nan():
-    assert np.isnan(Steps.certain_of_nothing(random_steps(3)).covariances).all()
+    assert np.isnan(Steps.with_unknown_covariance(random_steps(3)).covariances).all()
 
 
 @pytest.mark.parametrize("heading", [0.0, 1.0, pi / 2, 3.0, -2.5])
@@ -106,16 +105,6 @@ def test_noise_hardly_changes_the_distance_of_a_robot_that_turns_on_the_spot():
         0, [0.02, 0.02, 0], (500, 3)
     )
     assert np.abs(motions_of(steps)[:, 0]).max() < 0.1
-
-
-def test_errors_of_steps_are_seen_from_where_the_true_one_ends():
-    truth = np.array([[1.0, 0.0, pi / 2]])
-    np.testing.assert_allclose(
-        step_errors(truth + np.array([0.0, 0.2, 0.1]), truth), [[0.2, 0, 0.1]], atol=1e-12
-    )
-    np.testing.assert_allclose(
-        step_errors(truth + np.array([-0.3, 0.0, 2 * pi]), truth), [[0, 0.3, 0]], atol=1e-12
-    )
 
 
 def test_turn_across_the_seam_is_small():

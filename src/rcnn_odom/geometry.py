@@ -59,7 +59,7 @@ class Steps:
     covariances: FloatArray
 
     @classmethod
-    def certain_of_nothing(cls, values: npt.ArrayLike) -> "Steps":
+    def with_unknown_covariance(cls, values: npt.ArrayLike) -> "Steps":
         """Steps (N-1, 3) of a method that does not know how good they are."""
         values = np.asarray(values, dtype=np.float64).reshape(-1, 3)
         return cls(values, unknown_covariance(len(values)))
@@ -114,18 +114,6 @@ def motions_of(steps: npt.ArrayLike) -> FloatArray:
     """
     x, y, heading = np.moveaxis(np.asarray(steps, dtype=np.float64), -1, 0)
     return np.stack([x * np.cos(heading / 2) + y * np.sin(heading / 2), heading], axis=-1)
-
-
-def step_errors(steps: FloatArray, truth: FloatArray) -> FloatArray:
-    """Errors (N, 3) of steps (N, 3) in metres and radians, seen from where the true step ends.
-
-    The first is along the true heading of the later scan, the second to its left, the third the heading.
-    """
-    difference = steps - truth
-    cos, sin = np.cos(truth[:, 2]), np.sin(truth[:, 2])
-    ahead = cos * difference[:, 0] + sin * difference[:, 1]
-    left = cos * difference[:, 1] - sin * difference[:, 0]
-    return np.stack([ahead, left, wrap_angle(difference[:, 2])], axis=1)
 
 
 def motion_errors(motions: FloatArray, truth: FloatArray) -> FloatArray:

@@ -4,7 +4,7 @@ import math
 import types
 import typing
 from collections.abc import Callable
-from dataclasses import field, fields, is_dataclass
+from dataclasses import MISSING, field, fields, is_dataclass
 from typing import Any
 
 from rcnn_odom.errors import InputError
@@ -14,6 +14,7 @@ WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "
 
 def option(
     *,
+    default: Any = MISSING,
     above: float | None = None,
     least: float | None = None,
     below: float | None = None,
@@ -24,6 +25,7 @@ def option(
     """A field of an options dataclass, with its bounds.
 
     Args:
+        default: makes it one that may be left out.
         above, least, below: bounds of a number: greater than, at least, less than.
         choices: words that are allowed.
         fits: a condition that no bound can say.
@@ -37,19 +39,21 @@ def option(
         "fits": fits,
         "wanted": wanted,
     }
-    return field(metadata=bounds)
+    return field(default=default, metadata=bounds)
 
 
 def check_options(options: type, values: dict[str, Any], prefix: str, *, partly: bool = False) -> None:
     """Compares the values of options with their dataclass; nested groups with nested dataclasses.
 
-    A field whose type admits None may be null. Fields with a default may be left out.
+    A field whose type admits None may be null. Fields with a default may be left out, and are
+    filled in unless ``partly``.
 
     Args:
         options: a dataclass.
         values: plain values by name.
         prefix: of their names on the command line, ``model.``.
-        partly: values may be missing, and others that the dataclass does not know be there.
+        partly: values may be missing, or refer to another by ``${...}``, and others that the dataclass does
+            not know be there.
 
     Raises:
         InputError: an option is missing, unknown, of another type, or outside its bounds.
@@ -60,12 +64,14 @@ def check_options(options: type, values: dict[str, Any], prefix: str, *, partly:
         raise InputError(f"{prefix}{name}: there is no such option; there are {', '.join(sorted(known))}")
     for name, each in known.items():
         if name not in values:
-            if not partly and each.default is each.default_factory:  # both are MISSING
+            if not partly and each.default is MISSING:
                 raise InputError(
                     f"{prefix}{name} is missing; it may be that of an older version: train again"
                 )
-            continue
-        _check(f"{prefix}{name}", values[name], types_of[name], each.metadata, partly)
+            if not partly:
+                values[name] = each.default
+        elif isinstance(values[name], dict) or not (partly and "${" in str(values[name])):
+            _check(f"{prefix}{name}", values[name], types_of[name], each.metadata, partly)
 
 
 def _check(name: str, value: Any, kind: Any, bounds: Any, partly: bool) -> None:
@@ -75,7 +81,8 @@ def _check(name: str, value: Any, kind: Any, bounds: Any, partly: bool) -> None:
             raise InputError(f"{name}={value}: has parts to set, for instance {name}.{first}=...")
         check_options(kind, value, f"{name}.", partly=partly)  # type: ignore[arg-type]
         return
-    allowed = typing.get_args(kind) if isinstance(kind, types.UnionType) else (kind,)
+    is_union = typing.get_origin(kind) in (types.UnionType, typing.Union)
+    allowed = typing.get_args(kind) if is_union else (kind,)
     if value is None and type(None) in allowed:
         return
     if not (_is_kind(value, allowed) and _within(value, bounds)):

@@ -18,10 +18,11 @@ from typing import Any
 from rcnn_odom.errors import InputError
 
 
-def modules_in(package: str) -> Iterator[ModuleType]:
-    """Imports the modules of a package, one after the other by name."""
-    for module in iter_modules(import_module(package).__path__, f"{package}."):
-        yield import_module(module.name)
+def modules_in(package: str, last: tuple[str, ...] = ()) -> Iterator[ModuleType]:
+    """Imports the modules of a package, one after the other by name, some of them after the others."""
+    names = {module.name for module in iter_modules(import_module(package).__path__)}
+    for name in (*sorted(names - set(last)), *last):
+        yield import_module(f"{package}.{name}")
 
 
 def collect(what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], None]) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import json
 import os
+import runpy
 import subprocess
 import sys
 from pathlib import Path
@@ -137,12 +138,12 @@ def test_a_file_that_may_not_be_read(drive, capsys):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--lengths", "ten"], "is not a list of numbers"),
-        (["--lengths", ""], "is not a list of numbers"),
-        (["--lengths", "10,,20"], "is not a list of numbers"),
-        (["--lengths", "10,0"], "must be positive"),
-        (["--lengths=-5"], "must be positive"),
-        (["--lengths", "nan"], "must be positive"),
+        (["--lengths", "ten"], "is not a number of metres above 0"),
+        (["--lengths", ""], "is not a number of metres above 0"),
+        (["--lengths", "10,,20"], "is not a number of metres above 0"),
+        (["--lengths", "10,0"], "is not a number of metres above 0"),
+        (["--lengths=-5"], "is not a number of metres above 0"),
+        (["--lengths", "nan"], "is not a number of metres above 0"),
         (["--step", "0"], "1 or more"),
         (["--step", "2.5"], "1 or more"),
         (["--nonsense"], "unrecognized arguments"),
@@ -187,6 +188,7 @@ def test_a_reader_that_leaves_gets_no_traceback(drive):
 
 def test_drift_does_not_wait_for_torch(drive):
     code = f"""
+import runpy
 import sys
 from rcnn_odom.cli import main
 main({["drift", *drive]!r})
@@ -259,15 +261,18 @@ def test_frames_outside_of_the_drive(motions, capsys, frames):
 @pytest.mark.parametrize(
     ("text", "message"),
     [
-        ("", ".csv:1: the header must be frame,distance_m,heading_rad,true_distance_m,true_heading_rad"),
-        ("1 2 3\n", ".csv:1: the header must be"),
+        ("", ".csv: is empty; give a file of motions"),
+        (
+            "1 2 3\n",
+            ".csv:1: the header must be frame,distance_m,heading_rad,true_distance_m,true_heading_rad",
+        ),
         (f"{HEADER},slam_distance_m\n1,1,0,1,0,1\n", ".csv:1: the header must be"),
         (f"{HEADER},true_distance_m,true_heading_rad\n1,1,0,1,0,1,0\n", ".csv:1: the header must be"),
         (f"{HEADER}\n", ".csv: has no motion under its header"),
-        (f"{HEADER}\n1,1,0,1,0\n2,1,x,1,0\n", ".csv:3: not numbers: could not convert"),
-        (f"{HEADER}\n1,1,0,1\n", ".csv:2: found 4 fields where the header has 5"),
-        (f"{HEADER}\n1,1,0,1,0\n\n2,1,0,1,0\n", ".csv:3: found 1 fields where the header has 5"),
-        (f"{HEADER}\n1,nan,0,1,0\n", ".csv:2: a motion must be finite"),
+        (f"{HEADER}\n1,1,0,1,0\n2,1,x,1,0\n", ".csv:3: could not convert"),
+        (f"{HEADER}\n1,1,0,1\n", ".csv:2: found 4 fields, but a line has 5"),
+        (f"{HEADER}\n1,1,0,1,0\n\n2,1,0,1,0\n", ".csv:3: found 1 fields, but a line has 5"),
+        (f"{HEADER}\n1,nan,0,1,0\n", ".csv:2: found nan or inf"),
         (f"{HEADER}\n1,1,0,1,0\n3,1,0,1,0\n", ".csv:3: frame 3 where 2 comes"),
     ],
 )
@@ -378,3 +383,11 @@ def test_wrong_usage_of_simulate(capsys, options, message):
         main(["simulate", *options])
     assert exit_status.value.code == 2
     assert message in capsys.readouterr().err
+
+
+def test_as_a_module_of_python(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["rcnn-odom", "--help"])
+    with pytest.raises(SystemExit) as stopped:
+        runpy.run_module("rcnn_odom.cli", run_name="__main__")
+    assert stopped.value.code == 0
+    assert "drift" in capsys.readouterr().out

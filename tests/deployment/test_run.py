@@ -279,6 +279,7 @@ def test_trouble_is_counted_by_kind(model, tmp_path):
     assert np.all(np.diff(read_tum(tmp_path / "out" / "trajectory.tum")[0]) > 0)
 
 
+@pytest.mark.slow
 def test_memory_is_constant_over_a_long_stream(model):
     """A fifth of an hour of scans, made as they are read."""
     import tracemalloc

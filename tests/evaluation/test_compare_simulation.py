@@ -73,6 +73,7 @@ def test_undone_motion_leaves_nothing_of_a_still_world() -> None:
     assert wrong["change p50 (m)"] > 1
 
 
+@pytest.mark.slow
 def test_simulated_towns_look_like_the_real_ones() -> None:
     if not KITTI.is_dir():
         pytest.skip(f"no real recordings in {KITTI}")
@@ -85,6 +86,7 @@ def test_simulated_towns_look_like_the_real_ones() -> None:
     assert 0.2 * long_runs < towns["empty in runs of 100-3599"] < long_runs
 
 
+@pytest.mark.slow
 def test_simulated_scans_change_like_the_real_ones() -> None:
     """Only 90's truth can be trusted; it jitters by some centimetres, which the changes contain."""
     if not KITTI.is_dir():

@@ -167,6 +167,7 @@ def two_processes(tmp_path_factory):
 
 
 @pytest.mark.parametrize("case", SHARES)
+@pytest.mark.slow
 def test_two_processes_equal_one(two_processes, case):
     alone = as_floats(send(new_metric(), *NAMES).compute())
     for results in two_processes:

@@ -47,11 +47,11 @@ def straight(frames=31, name="straight"):
 
 
 def ahead(frames, distance):
-    return Steps.certain_of_nothing(np.tile([distance, 0.0, 0.0], (frames - 1, 1)))
+    return Steps.with_unknown_covariance(np.tile([distance, 0.0, 0.0], (frames - 1, 1)))
 
 
 def in_two_numbers(sequence, apply="end"):
-    return Steps.certain_of_nothing(steps_of(sequence.motions, apply))
+    return Steps.with_unknown_covariance(steps_of(sequence.motions, apply))
 
 
 def test_errors_are_signed_where_they_say_so():
@@ -122,7 +122,7 @@ def test_step_is_taken_where_asked_for(apply, sides):
 
 
 def test_trajectory_is_in_the_frame_of_the_camera():
-    steps = Steps.certain_of_nothing(steps_of([[2.0, np.pi / 2], [1.0, 0.0]], "start"))
+    steps = Steps.with_unknown_covariance(steps_of([[2.0, np.pi / 2], [1.0, 0.0]], "start"))
     poses = change_frame(steps.poses(), FORWARD_CAMERA)
     # Ahead is z; left is -x.
     np.testing.assert_allclose(poses[:, :3, 3], [(0, 0, 0), (0, 0, 2), (-1, 0, 2)], atol=1e-12)
@@ -266,7 +266,7 @@ class Standing:
 def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     sequence = drive([(0, 0, 0), (1, 0, 0), (1, 1.5, 0.25)], "05")
     data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
-    steps = Steps.certain_of_nothing(steps_of([[0.875, 0.0], [1.25, -0.5]], "end"))
+    steps = Steps.with_unknown_covariance(steps_of([[0.875, 0.0], [1.25, -0.5]], "end"))
     mean = np.array([0.75, 0.0, 0.0])
     report = report_drives("cnn_reg", {"05": steps}, mean, Standing(), [sequence], data, tmp_path)
     header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
@@ -289,7 +289,7 @@ SIDEWAYS = [(frame, 0.5 * frame, 0.1 * (frame % 2)) for frame in range(31)]
 def test_steps_are_scored_with_their_sideways_part():
     sequence = drive(SIDEWAYS)
     cut_to_two = score(sequence, in_two_numbers(sequence), [10.0])
-    whole = score(sequence, Steps.certain_of_nothing(sequence.steps), [10.0])
+    whole = score(sequence, Steps.with_unknown_covariance(sequence.steps), [10.0])
     assert whole["drift"]["t_err"] == pytest.approx(0, abs=1e-12)
     assert whole["drift"]["segments"] == cut_to_two["drift"]["segments"] > 0
     assert cut_to_two["drift"]["t_err"] > 0.1
@@ -305,7 +305,7 @@ def test_the_report_of_whole_steps_has_a_row_of_two_numbers_and_no_mean_motion(t
     for (x0, y0, heading0), (x1, y1, heading1) in pairwise(SIDEWAYS):
         place = complex(x1 - x0, y1 - y0) * np.exp(-1j * heading0)
         steps.append((place.real, place.imag, heading1 - heading0))
-    estimated = {"05": Steps.certain_of_nothing(steps)}
+    estimated = {"05": Steps.with_unknown_covariance(steps)}
     data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
     figures = {}
     report = report_drives(
@@ -330,7 +330,7 @@ def test_rounding_to_single_precision_makes_no_row_of_two_numbers(tmp_path, appl
     sequence = drive(SIDEWAYS, "05")
     rounded = in_two_numbers(sequence, apply).values.astype(np.float32)
     data = {"name": "kitti", "lengths": [10.0], "apply": apply}
-    steps = {"05": Steps.certain_of_nothing(rounded)}
+    steps = {"05": Steps.with_unknown_covariance(rounded)}
     report = report_drives("rcnn_reg", steps, None, Standing(), [sequence], data, tmp_path)
     assert list(report["baselines"]) == ["held_motion"]
 
@@ -382,7 +382,18 @@ def test_coverage_by_hand(tmp_path):
     assert coverage_table({"05": report}).splitlines()[-1].split() == [
         *["05", "50.0", "100.0", "50.0", "100.0", "0.200", "1.719"]
     ]
-    assert coverage(Steps.certain_of_nothing(values), truth) is None
+    assert coverage(Steps.with_unknown_covariance(values), truth) is None
+    # Checkpoints of version 0.1 do not know how far a step goes to the side, but how well they know the turn.
+    covariances = covariances.copy()
+    covariances[:, :2] = covariances[:, :, :2] = np.nan
+    heading = coverage(Steps(values, covariances), truth)
+    assert heading == {name: report[name] for name in ("heading", "heading_deg")}
+    assert coverage_table({"05": heading}).splitlines()[-1].split() == [
+        "05",
+        "-",
+        "-",
+        *["50.0", "100.0", "-", "1.719"],
+    ]
     sequence = drive([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], "05")
     data = {"name": "kitti", "lengths": [1.0], "apply": "middle"}
     written = report_drives("net", {"05": steps}, None, Standing(), [sequence], data, tmp_path)
@@ -450,6 +461,12 @@ def test_what_is_no_metric_is_refused_in_a_line(monkeypatch, name, metric, said)
     with pytest.raises(InputError, match=said) as refused:
         all_metrics()
     assert "\n" not in str(refused.value)
+
+
+def test_a_metric_may_give_a_number_of_numpys(monkeypatch):
+    add_metrics(monkeypatch, ones=replace(FARTHEST, name="ones", compute=lambda *_: np.float32(1)))
+    report = score_all([straight(31, "a")], {"a": ahead(31, 1.1)}, [5.0])
+    assert json.loads(json.dumps(report))["metrics"]["ones"] == 1.0
 
 
 def test_metrics_are_combined_as_they_say():

@@ -16,7 +16,7 @@ from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.models.two_numbers import steps_of
 from rcnn_odom.options import check_options
 from rcnn_odom.recordings.recording import Drive
-from rcnn_odom.training import defaults  # noqa: F401  (what the files of conf look up)
+from rcnn_odom.training import settings  # noqa: F401  (what the files of conf look up)
 
 torch.set_num_threads(1)
 

@@ -130,8 +130,8 @@ def test_ring_starts(azimuths: tuple[float, ...], starts: list[int]) -> None:
     ("path", "match"),
     [
         ("poses/00.txt", r"poses/00\.txt: no such file; the ground truth .*none for 11 to 21"),
-        ("sequences/00/calib.txt", r"calib\.txt: no such file"),
-        ("sequences/00/times.txt", r"times\.txt: no such file"),
+        ("sequences/00/calib.txt", r"calib\.txt: cannot be read: No such file"),
+        ("sequences/00/times.txt", r"times\.txt: cannot be read: No such file"),
     ],
 )
 def test_missing_text(root: Path, path: str, match: str) -> None:
@@ -181,8 +181,8 @@ def test_scan_with_no_or_a_taken_number(root: Path, name: str) -> None:
     ("line", "match"),
     [
         ("T: 1 0 0", "no line starts with 'Tr:'"),
-        ("Tr: 1 0 0", r"calib\.txt:5: expected 12 finite numbers"),
-        ("Tr: 1 0 0 0 0 1 0 0 0 0 one 0", r"calib\.txt:5: expected 12 finite numbers"),
+        ("Tr: 1 0 0", r"calib\.txt:5: .*, but Tr has 12 finite numbers"),
+        ("Tr: 1 0 0 0 0 1 0 0 0 0 one 0", r"calib\.txt:5: .*, but Tr has 12 finite numbers"),
         ("Tr: 1 0 0 0 0 1 0 0 0 0 0 0", r"calib\.txt:5: Tr holds no rotation"),
     ],
 )
@@ -195,11 +195,11 @@ def test_bad_calibration(root: Path, line: str, match: str) -> None:
 @pytest.mark.parametrize(
     ("line", "match"),
     [
-        ("1 0 0", "12 numbers"),
-        ("1 0 0 0 0 1 0 0 0 0 1 nan", "must be finite"),
-        ("1 0 0 0 0 1 0 0 0 0 1 x", "12 numbers"),
+        ("1 0 0", "12 finite numbers"),
+        ("1 0 0 0 0 1 0 0 0 0 1 nan", "found nan or inf"),
+        ("1 0 0 0 0 1 0 0 0 0 1 x", "12 finite numbers"),
         ("0 0 0 0 0 0 0 0 0 0 0 0", "must be a rotation"),
-        ("", "12 numbers"),
+        ("", "12 finite numbers"),
     ],
 )
 def test_bad_pose(root: Path, line: str, match: str) -> None:
@@ -211,7 +211,7 @@ def test_bad_pose(root: Path, line: str, match: str) -> None:
 @pytest.mark.parametrize("line", ["now", "nan", "1 2"])
 def test_bad_time(root: Path, line: str) -> None:
     replace_line(root / "sequences" / "00" / "times.txt", 2, line)
-    with pytest.raises(InputError, match=r"times\.txt:2: expected 1 finite number,"):
+    with pytest.raises(InputError, match=r"times\.txt:2: .*, but a time stamp is 1 finite number"):
         kitti.load("00", root=root)
 
 

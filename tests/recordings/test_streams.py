@@ -250,7 +250,15 @@ def test_another_laser_than_the_models_is_refused(tmp_path):
     need_fitting_scan(stream_of(), points, fits)
 
 
-@pytest.mark.parametrize("name", ["aces", "intel", "mit-csail", "mit-killian"])
+@pytest.mark.parametrize(
+    "name",
+    [
+        pytest.param("intel", marks=pytest.mark.slow),
+        pytest.param("mit-killian", marks=pytest.mark.slow),
+        "aces",
+        "mit-csail",
+    ],
+)
 def test_real_logs_give_the_scans_of_their_sequence(name):
     root = REAL / "carmen"
     if not root.is_dir():

@@ -83,9 +83,9 @@ def test_scoring_the_file_is_scoring_the_array(tmp_path):
         (f"{ROW}\n{ROW} 1\n", r"poses\.txt:2: found 13 fields"),
         (f"{ROW}\n1 2 3\n", r"poses\.txt:2: found 3 fields"),
         (f"{ROW}\n\n{ROW}\n", r"poses\.txt:2: found 0 fields"),
-        (f"{ROW}\n{ROW[:-1]}x\n", r"poses\.txt:2: not a KITTI pose .*'x'"),
-        (f"{ROW[:-1]}nan\n", r"poses\.txt:1: a pose must be finite"),
-        (f"{ROW}\n{ROW}\n{ROW[:-1]}-inf\n", r"poses\.txt:3: a pose must be finite"),
+        (f"{ROW}\n{ROW[:-1]}x\n", r"poses\.txt:2: .*'x', but a KITTI pose has 12 finite numbers"),
+        (f"{ROW[:-1]}nan\n", r"poses\.txt:1: found nan or inf"),
+        (f"{ROW}\n{ROW}\n{ROW[:-1]}-inf\n", r"poses\.txt:3: found nan or inf"),
     ],
 )
 def test_read_kitti_names_the_line(tmp_path, text, message):

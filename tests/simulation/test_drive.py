@@ -143,6 +143,7 @@ TOLERANCES = {
 }
 
 
+@pytest.mark.slow
 def test_motion_is_like_that_of_real_drives() -> None:
     if not REAL.is_dir():
         pytest.skip("../shared/data/kitti_gt_poses is not here: no real drives to compare with")

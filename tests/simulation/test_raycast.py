@@ -6,6 +6,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from rcnn_odom.geometry import FloatArray
+from rcnn_odom.simulation import raycast
 from rcnn_odom.simulation.raycast import HIT_GROUND, NO_WALL, cast
 from rcnn_odom.simulation.scene import Walls
 from rcnn_odom.simulation.terrain import Ground, random_ground
@@ -162,3 +163,17 @@ def test_the_nearer_of_wall_and_ground_is_met() -> None:
     depth, hit, _ = cast(walls, ground, origin, fan(np.array([0, np.pi, np.pi / 2]), -0.05), MAX_RANGE)
     np.testing.assert_allclose(depth, [30, 40, 40], rtol=1e-9)
     np.testing.assert_array_equal(hit, [0, HIT_GROUND, HIT_GROUND])
+
+
+def test_compiled_and_interpreted_are_the_same(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(5)
+    corner = np.array([-100.0, -100.0])
+    ground, origin = random_ground(corner, -corner, rng), np.array([1.0, 2.0, 1.5])
+    arguments = random_walls(rng, 30), ground, origin, fan(rng.uniform(-np.pi, np.pi, 100), -0.05), MAX_RANGE
+    compiled = cast(*arguments)
+    for name in ("_first_beam", "_nearest_walls", "_squareness", "_meet_ground"):
+        monkeypatch.setattr(raycast, name, getattr(raycast, name).py_func)
+    for one, other in zip(cast(*arguments), compiled, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-12)
+    assert HIT_GROUND in compiled[1]
+    assert (compiled[1] >= 0).any()

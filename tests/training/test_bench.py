@@ -14,6 +14,7 @@ from rcnn_odom.training import bench, bench_train
 from rcnn_odom.training.bench import Way
 
 
+@pytest.mark.slow
 def test_all_ways_are_measured_and_compared(monkeypatch, capsys):
     threads = torch.get_num_threads()
     for name, value in {"ROUNDS": 1, "WARM_UP": 0, "TIMED": 2, "FRAMES": 8, "HIDDEN": 32}.items():
@@ -61,6 +62,7 @@ def test_the_eager_network_is_the_same_network():
     np.testing.assert_allclose(got, expected.motion[0].numpy(), atol=1e-5)
 
 
+@pytest.mark.slow
 def test_the_floor_reads_memory_that_is_there(monkeypatch):
     """An array that was never written is one page of zeros for the system, read from the nearest cache."""
     statm = Path("/proc/self/statm")

@@ -90,6 +90,7 @@ def assert_every_chart_has_scalars(run):
             assert any(re.match(pattern, tag) for tag in events.Tags()["scalars"]), (chart, pattern)
 
 
+@pytest.mark.slow
 def test_every_chart_of_a_sweeps_runs_has_scalars(sweep):
     for run in sweep.glob("*/tensorboard"):
         assert_every_chart_has_scalars(run.parent)
@@ -101,6 +102,7 @@ def test_every_chart_of_a_recurrent_run_and_its_first_stage_has_scalars(configur
     assert_every_chart_has_scalars(tmp_path / "outputs" / "run" / "first_stage")
 
 
+@pytest.mark.slow
 def test_the_row_of_a_run_has_its_settings_and_drift(sweep, scores):
     found = set()
     for run in sweep.glob("*/tensorboard"):
@@ -158,6 +160,7 @@ def tensorboard(sweep, tmp_path_factory):
         server.wait(timeout=30)
 
 
+@pytest.mark.slow
 def test_the_server_finds_the_setting_that_differs(tensorboard):
     columns = ask_experiment(tensorboard)["hparamInfos"]
     assert [column["name"] for column in columns if column.get("differs")] == ["model.kernel_size"]
@@ -222,6 +225,7 @@ def open_tab(browser, tensorboard):
     return open_tab
 
 
+@pytest.mark.slow
 def test_the_table_of_the_hparams_tab_has_swept_values_and_drift(open_tab, scores):
     header, *rows = open_tab(
         "hparams", TABLE, lambda table: len(table) == 1 + len(KERNELS) and all(table[-1][2:])
@@ -235,6 +239,7 @@ def test_the_table_of_the_hparams_tab_has_swept_values_and_drift(open_tab, score
     assert shown == {k: pytest.approx(s["test"]["drift"], rel=1e-4) for k, s in scores.items()}
 
 
+@pytest.mark.slow
 def test_the_custom_scalars_have_groups_and_lines(open_tab, sweep):
     charts = patterns_of(events_of(next(sweep.glob("*/tensorboard")).parent))
     titles = {title for chart in charts for title in chart}
@@ -247,6 +252,7 @@ def test_the_custom_scalars_have_groups_and_lines(open_tab, sweep):
     open_tab("custom_scalars", LINES, is_there)
 
 
+@pytest.mark.slow
 def test_the_scalars_and_the_figures_are_shown(open_tab):
     open_tab("scalars", LINES, lambda lines: {"train", "val", "drift/test", "drift/test/05"} <= set(lines))
     # Trajectory, motions and coverage of each run, loaded to their pixels.

@@ -46,6 +46,7 @@ def drift_of_one_process(module, settings, split):
     return {name: value for name, value in scores.items() if "drift" in name or "mae" in name}
 
 
+@pytest.mark.slow
 def test_two_processes_score_as_one_and_log_once(configure, uneven, tmp_path, capfd):
     options = ["model=rcnn_reg", *uneven, "model.first_stage.epochs=2", "model.epochs=3"]
     configuration = configure(*options, "trainer=ddp")
@@ -76,6 +77,7 @@ def test_two_processes_score_as_one_and_log_once(configure, uneven, tmp_path, ca
     assert min(point.value for point in events.Scalars("val/drift")) == pytest.approx(metrics["val"]["drift"])
 
 
+@pytest.mark.slow
 def test_new_worlds_are_made_once_and_shared(configure, tmp_path, capfd):
     options = ["data.fresh_worlds=true", "data.keep_worlds=true", "trainer=ddp"]
     train(configure("model=cnn_reg", *STUB, *options))
@@ -84,6 +86,7 @@ def test_new_worlds_are_made_once_and_shared(configure, tmp_path, capfd):
     assert names == ["00", "00~1", "02", "02~1", "05", "10"]
 
 
+@pytest.mark.slow
 def test_a_mistake_in_a_process_is_one_line(configure, uneven):
     options = ["trainer=ddp", "model.learning_rate=1e30", "trainer.gradient_clip_val=null"]
     with pytest.raises(InputError, match="training diverged in epoch 1") as failure:
@@ -96,6 +99,7 @@ def test_a_batch_must_come_out_even(configure, uneven):
         train(configure("model=cnn_reg", *uneven, "trainer=ddp", "model.batch_size=7"))
 
 
+@pytest.mark.slow
 def test_more_devices_than_windows_are_refused(configure, kitti):
     with pytest.raises(InputError, match="have 1 windows of 32 pairs, fewer than the 2 devices"):
         train(configure("model=rcnn_reg", *kitti, "trainer=ddp", "model.window=32"))
@@ -141,6 +145,7 @@ def saved(outputs, which):
 
 
 @pytest.mark.parametrize("everyone", [False, True])
+@pytest.mark.slow
 def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, everyone):
     """By SIGTERM to the process that was started, or by Ctrl-C, which all in the terminal get."""
     process = start(uneven, tmp_path / "stopped", 3)

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import re
+import shutil
 import subprocess
 import sys
 
@@ -13,7 +14,7 @@ import yaml
 from hydra import compose, initialize_config_dir
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
-from conftest import LENGTHS, ROOT
+from conftest import LENGTHS, ROOT, configure_in
 from data.make_carmen import make_carmen
 from evaluate import evaluate
 from rcnn_odom import cli
@@ -30,11 +31,25 @@ from train import train
 VARIANTS = ["cnn_reg", "cnn_cls", "rcnn_reg", "rcnn_cls"]
 
 
+@pytest.fixture(scope="module")
+def trained(kitti, tmp_path_factory):
+    """A function: the folder and the metrics of a variant's run, trained once and only to be read."""
+    runs = {}
+
+    def trained(variant):
+        if variant not in runs:
+            folder = tmp_path_factory.mktemp(variant)
+            metrics = train(configure_in(folder)(f"model={variant}", *kitti))
+            runs[variant] = folder / "outputs" / "run", metrics
+        return runs[variant]
+
+    return trained
+
+
 @pytest.mark.parametrize("variant", VARIANTS)
-def test_a_run_leaves_everything_behind(configure, kitti, tmp_path, variant):
-    metrics = train(configure(f"model={variant}", *kitti))
-    run = tmp_path / "outputs" / "run"
-    assert (tmp_path / "outputs" / "latest" / "config.yaml").resolve().parent == run
+def test_a_run_leaves_everything_behind(trained, kitti, variant):
+    run, metrics = trained(variant)
+    assert (run.parent / "latest" / "config.yaml").resolve().parent == run
     assert json.loads((run / "metrics.json").read_text()) == metrics
     assert yaml.safe_load((run / "config.yaml").read_text())["model"]["variant"] == variant
     assert (run / BEST).exists()
@@ -51,10 +66,11 @@ def test_a_run_leaves_everything_behind(configure, kitti, tmp_path, variant):
     assert 0 <= metrics["test"]["floor"] < metrics["baselines"]["held_motion"]["drift"]
 
 
-def test_the_command_line_prints_the_drift_of_metrics_json(configure, kitti, tmp_path, capsys):
-    metrics = train(configure("model=cnn_reg", *kitti))
+def test_the_command_line_prints_the_drift_of_metrics_json(trained, kitti, capsys):
+    run, metrics = trained("cnn_reg")
     root = kitti[0].split("=")[1]
-    trajectory = tmp_path / "outputs" / "run" / "trajectories" / "05.txt"
+    trajectory = run / "trajectories" / "05.txt"
+    capsys.readouterr()
     arguments = [f"{root}/poses/05.txt", str(trajectory), "--planar", "--lengths", "10,20", "--json"]
     assert cli.main(["drift", *arguments]) == 0
     printed = json.loads(capsys.readouterr().out)
@@ -65,9 +81,9 @@ def test_the_command_line_prints_the_drift_of_metrics_json(configure, kitti, tmp
     assert printed["r_err_deg_per_m"] == pytest.approx(expected["r_err_deg_per_m"], rel=1e-3)
 
 
-def test_tensorboard_has_losses_rate_drift_figures_and_hparams(configure, kitti, tmp_path):
-    metrics = train(configure("model=cnn_cls", *kitti))
-    events = EventAccumulator(str(tmp_path / "outputs" / "run" / "tensorboard"), {"tensors": 0, "images": 0})
+def test_tensorboard_has_losses_rate_drift_figures_and_hparams(trained):
+    run, metrics = trained("cnn_cls")
+    events = EventAccumulator(str(run / "tensorboard"), {"tensors": 0, "images": 0})
     events.Reload()
     tags = events.Tags()
     assert {
@@ -111,9 +127,8 @@ def test_a_cnn_cls_run_serves_as_first_stage(configure, kitti, tmp_path, caplog)
     assert f"first stage: {tmp_path / 'outputs' / 'cnn' / BEST}" in caplog.text
 
 
-def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(configure, kitti, tmp_path):
-    train(configure("model=cnn_cls", *kitti, run="cnn"))
-    stage = tmp_path / "outputs" / "cnn" / BEST
+def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(trained, configure, kitti, tmp_path):
+    stage = trained("cnn_cls")[0] / BEST
     weights = torch.load(stage, weights_only=True)["state_dict"]
     for freeze in (True, False):
         run = f"freeze_{freeze}"
@@ -131,19 +146,19 @@ def test_freezing_keeps_the_first_stage_and_fine_tuning_changes_it(configure, ki
         assert all(same) == freeze
 
 
-def test_evaluating_again_gives_the_same_numbers(configure, kitti, tmp_path):
-    trained = train(configure("model=rcnn_reg", *kitti))
-    again = evaluate(configure(f"run={tmp_path}/outputs/run", name="evaluate", run="evaluation"))
-    assert again["test"] == trained["test"]
-    assert again["baselines"] == trained["baselines"]
+def test_evaluating_again_gives_the_same_numbers(trained, configure, tmp_path):
+    run, metrics = trained("rcnn_reg")
+    again = evaluate(configure(f"run={run}", name="evaluate", run="evaluation"))
+    assert again["test"] == metrics["test"]
+    assert again["baselines"] == metrics["baselines"]
     assert (tmp_path / "outputs" / "evaluation" / "metrics.json").exists()
     assert (tmp_path / "outputs" / "evaluation" / "config.yaml").exists()
 
 
-def test_evaluating_on_other_data(configure, kitti, tmp_path):
-    train(configure("model=cnn_reg", *kitti))
+def test_evaluating_on_other_data(trained, configure):
     options = ["data=simulated", "data.frames=50", "data.test=[07]", "data.sensor.resolution_deg=1.0"]
-    scores = evaluate(configure(f"run={tmp_path}/outputs/run", *options, name="evaluate", run="evaluation"))
+    run, _ = trained("cnn_reg")
+    scores = evaluate(configure(f"run={run}", *options, name="evaluate", run="evaluation"))
     assert scores["data"] == "simulated"
     # 50 frames are shorter than 100 m: said, not scored.
     assert scores["test"]["drift"] is None
@@ -166,8 +181,8 @@ def test_carmen_logs_of_two_beam_counts_train_together(configure, tmp_path):
     assert metrics["test"]["sequences"]["wide"]["moving"]["frames"] > 0
 
 
-def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, monkeypatch, caplog):
-    whole = train(configure("model=cnn_reg", *kitti, run="whole"))
+def test_a_stopped_run_goes_on_to_the_same_result(trained, configure, kitti, tmp_path, monkeypatch, caplog):
+    _, whole = trained("cnn_reg")
 
     def stop(self, trainer, module):
         if trainer.current_epoch == 1:
@@ -182,8 +197,8 @@ def test_a_stopped_run_goes_on_to_the_same_result(configure, kitti, tmp_path, mo
     assert train(configure("model=cnn_reg", *kitti))["test"] == whole["test"]
 
 
-def test_a_run_folder_is_not_used_twice_or_for_something_else(configure, kitti, tmp_path):
-    train(configure("model=cnn_reg", *kitti))
+def test_a_run_folder_is_not_used_twice_or_for_something_else(trained, configure, kitti, tmp_path):
+    shutil.copytree(trained("cnn_reg")[0], tmp_path / "outputs" / "run")
     with pytest.raises(InputError, match="finished run"):
         train(configure("model=cnn_reg", *kitti))
     (tmp_path / "outputs" / "run" / "metrics.json").unlink()
@@ -191,24 +206,22 @@ def test_a_run_folder_is_not_used_twice_or_for_something_else(configure, kitti, 
         train(configure("model=cnn_reg", *kitti, "model.beta=3"))
 
 
-def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(configure, kitti, tmp_path):
-    train(configure("model=cnn_reg", *kitti, run="reg"))
-    train(configure("model=cnn_cls", *kitti, run="cls"))
-    runs = tmp_path / "outputs"
+def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(trained, configure, kitti, tmp_path):
+    runs = {variant: trained(variant)[0] for variant in ("cnn_reg", "cnn_cls")} | {"missing": tmp_path}
     recurrent = ["model=rcnn_reg", *kitti]
     for number, (run, option, message) in enumerate(
         [
-            ("reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
-            ("cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
-            ("cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
+            ("cnn_reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
+            ("cnn_cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
+            ("cnn_cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
             ("missing", "seed=0", "no such checkpoint"),
         ]
     ):
         with pytest.raises(InputError, match=message):
-            train(configure(*recurrent, f"model.pretrained={runs / run / BEST}", option, run=f"bad{number}"))
+            train(configure(*recurrent, f"model.pretrained={runs[run] / BEST}", option, run=f"bad{number}"))
     other = ["data=simulated", "data.frames=20"]
     with pytest.raises(InputError, match=r"resolution_deg=1\.0.*data has"):
-        evaluate(configure(f"run={runs}/reg", *other, name="evaluate", run="evaluation"))
+        evaluate(configure(f"run={runs['cnn_reg']}", *other, name="evaluate", run="evaluation"))
 
 
 @pytest.mark.parametrize(
@@ -281,6 +294,7 @@ def test_moving_a_drive_from_training_to_validation_asks_for_another_first_stage
 
 
 @pytest.mark.parametrize("augmented", ["false", "true"])
+@pytest.mark.slow
 def test_training_in_bf16_learns_a_drive_by_heart(configure, kitti, augmented):
     options = ["data.val=['00']", "data.test=['00']", "model.epochs=40", "trainer.precision=bf16-mixed"]
     options += [f"data.augment.mirror={augmented}", f"data.augment.max_turn_deg={int(augmented == 'true')}"]
@@ -366,6 +380,7 @@ def worlds_seen(monkeypatch):
     return seen
 
 
+@pytest.mark.slow
 def test_no_stage_sees_the_new_worlds_of_the_other(configure, worlds_seen):
     train(configure("model=rcnn_reg", *FRESH, "model.epochs=2", "model.first_stage.epochs=3"))
     assert len(worlds_seen) == 5
@@ -454,7 +469,7 @@ def test_small_training_set_has_more_epochs(options, epochs):
         ("data.world_seed=abc", "data.world_seed=abc: must be a whole number, not negative"),
         ("data.fresh_worlds=maybe", "data.fresh_worlds=maybe: must be true or false"),
         ("data.realism.tilt=1", "data.realism.tilt=1: must be true or false"),
-        ("data.sensor=3", "data.sensor=3: has parts to set, for instance data.sensor.max_range=..."),
+        ("data.sensor=3", "data.sensor=3: has parts to set, for instance data.sensor.resolution_deg=..."),
         ("data.realism=false", "data.realism=False: has parts to set"),
         ("+data.passes.small.cnn=3", "data.passes has become model.epochs and model.first_stage.epochs"),
     ],
@@ -475,10 +490,10 @@ def test_a_foreign_configuration_is_refused(configure, tmp_path, content):
     ("arguments", "message"),
     [
         (["train.py", "data=kitti"], "data.root is missing"),
-        (["train.py", "data=kitti", "data.root=nowhere"], "nowhere"),
+        pytest.param(["train.py", "data=kitti", "data.root=nowhere"], "nowhere", marks=pytest.mark.slow),
         (["train.py", "model.kernel=3"], "Could not override 'model.kernel'"),
         (["train.py", "data=kiti"], "Could not find 'data/kiti'"),
-        (["evaluate.py", "run=nowhere"], "nowhere/config.yaml"),
+        pytest.param(["evaluate.py", "run=nowhere"], "nowhere/config.yaml", marks=pytest.mark.slow),
     ],
 )
 def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, arguments, message):

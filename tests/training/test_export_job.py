@@ -55,6 +55,7 @@ def test_export_prints_the_drift_of_each_precision(run, capsys, monkeypatch):
     assert OnnxStepper(run / "model.onnx").metadata["drift"]["mean"] == pytest.approx(expected, abs=1e-4)
 
 
+@pytest.mark.slow
 def test_a_precision_that_costs_too_much_is_not_written(run, capsys, monkeypatch):
     monkeypatch.setattr(export_job, "ALLOWED", -1.0)
     assert main(["export", str(run), "--quantize", "int8"]) == 1

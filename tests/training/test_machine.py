@@ -19,6 +19,7 @@ def test_auto_precision_follows_the_processor(monkeypatch, capabilities, expecte
     assert resolve_precision("32-true", "cpu") == "32-true"
 
 
+@pytest.mark.slow
 def test_freed_memory_is_kept():
     if not sys.platform.startswith("linux"):
         pytest.skip("mallopt is glibc's")

@@ -33,8 +33,11 @@ def exported(tmp_path_factory):
     return folder, model
 
 
-@pytest.mark.parametrize("precision", ["fp32", "int8"])
-@pytest.mark.parametrize(("variant", "projection"), [*((name, None) for name in NAMES), ("rcnn_reg", 16)])
+@pytest.mark.parametrize("precision", ["fp32", pytest.param("int8", marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("variant", "projection"),
+    [("rcnn_reg", 16), *(pytest.param(name, None, marks=pytest.mark.slow) for name in NAMES)],
+)
 def test_streamed_steps_equal_the_checkpoints(variant, projection, precision):
     model = build(variant, projection)
     stepper = OnnxStepper(to_onnx(model, precision).SerializeToString())
@@ -49,6 +52,7 @@ def test_streamed_steps_equal_the_checkpoints(variant, projection, precision):
     assert (np.abs(steps(stepper, scans[:2]) - expected[:1]) <= tolerance).all()
 
 
+@pytest.mark.slow
 def test_the_file_can_be_used_without_this_project(exported):
     folder, model = exported
     # What follows is a stranger's program, who has read the description and has NumPy and ONNX Runtime.
@@ -184,7 +188,7 @@ class Toy(TrainedModel):
         return {"loss": self(batch["pairs"])[0].sub(batch["steps"]).abs().mean()}
 
 
-@pytest.mark.parametrize("precision", ["fp32", "int8"])
+@pytest.mark.parametrize("precision", ["fp32", pytest.param("int8", marks=pytest.mark.slow)])
 def test_a_model_of_a_plugin_is_exported_as_any_other(precision):
     torch.manual_seed(0)
     model = Toy().eval()

@@ -15,7 +15,7 @@ from torch.utils.tensorboard import SummaryWriter
 
 from conftest import ROOT
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, RUNNING
+from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, RUNNING, home_of
 from rcnn_odom.files import lock_if_free
 from rcnn_odom.training import job, run_state
 from rcnn_odom.training.run_state import (
@@ -201,6 +201,14 @@ def test_a_stopped_run_goes_on_with_edited_code_and_says_so(caplog, tmp_path):
 # --- outputs/latest ------------------------------------------------------------------------------
 
 
+def test_latest_as_the_folder_of_a_run_is_the_run_that_it_shows(run, tmp_path):
+    write_config(run, {"data": {}, "model": {}, "trainer": {}})
+    point_latest(tmp_path, run)
+    assert home_of(tmp_path / "latest").resolve() == run.resolve()
+    assert home_of(run) == run
+    assert home_of(tmp_path / "new") == tmp_path / "new"
+
+
 def test_latest_shows_the_run_but_tensorboard_sees_it_once(run, tmp_path):
     outputs = tmp_path / "outputs"
     for folder in (run, run / "first_stage"):
@@ -226,7 +234,9 @@ def test_latest_shows_the_run_but_tensorboard_sees_it_once(run, tmp_path):
 # --- the command line ----------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("option", ["data.beta.regression=3", "+data.beta.regression=3"])
+@pytest.mark.parametrize(
+    "option", ["data.beta.regression=3", pytest.param("+data.beta.regression=3", marks=pytest.mark.slow)]
+)
 def test_an_option_that_was_renamed_is_refused_with_its_new_name(tmp_path, option):
     command = [sys.executable, str(ROOT / "train.py"), option, f"outputs={tmp_path}"]
     done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=120)

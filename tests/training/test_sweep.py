@@ -112,6 +112,7 @@ def test_nothing_is_expected_of_what_is_no_grid(tmp_path):
     assert expected_folders(tmp_path) is None
 
 
+@pytest.mark.slow
 def test_a_failed_job_does_not_end_the_sweep_but_its_status(sweep, tmp_path):
     printed = sweep(
         "model=cnn_reg",
@@ -237,6 +238,7 @@ def _hold(folder, events):
         events.append(("out", os.getpid()))
 
 
+@pytest.mark.slow
 def test_one_process_at_a_time(tmp_path):
     context = get_context("spawn")
     with context.Manager() as manager:

@@ -2,11 +2,10 @@
 
 import argparse
 import json
-import math
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rcnn_odom.cli.arguments import Subcommands, whole_number
+from rcnn_odom.cli.arguments import Subcommands, metres, whole_number
 from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
@@ -42,13 +41,7 @@ def add(commands: Subcommands) -> None:
 
 
 def _parse_lengths(text: str) -> tuple[float, ...]:
-    try:
-        lengths = tuple(float(part) for part in text.split(","))
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is not a list of numbers such as 10,20,50") from None
-    if not all(math.isfinite(length) and length > 0 for length in lengths):
-        raise argparse.ArgumentTypeError(f"{text!r}: lengths must be positive")
-    return lengths
+    return tuple(map(metres, text.split(",")))
 
 
 def _run_drift(arguments: argparse.Namespace) -> int:

@@ -5,7 +5,7 @@ import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from rcnn_odom.cli.arguments import Subcommands
+from rcnn_odom.cli.arguments import Subcommands, metres
 from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
@@ -47,23 +47,13 @@ def add(commands: Subcommands) -> None:
     )
     add(
         "--loop-path",
-        type=_metres,
+        type=metres,
         metavar="M",
         default=LOOP_PATH,
         help="a relation closes a loop if the robot drove more metres between its scans (%(default)s)",
     )
     add("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=_run_relations)
-
-
-def _metres(text: str) -> float:
-    try:
-        metres = float(text)
-    except ValueError:
-        metres = 0.0
-    if not 0 < metres < float("inf"):
-        raise argparse.ArgumentTypeError(f"{text!r} is not a number of metres above 0")
-    return metres
 
 
 def _run_relations(arguments: argparse.Namespace) -> int:

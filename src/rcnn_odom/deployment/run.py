@@ -60,7 +60,7 @@ def run(
     """
     statistics = Statistics(stream, model)
     with ExitStack() as stack:
-        folder = stack.enter_context(closing(OutputFolder(out, stream))) if out else None
+        folder = OutputFolder(out, stream, stack) if out else None
         bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
         try:
             for scan in stack.enter_context(closing(bar)):
@@ -138,14 +138,15 @@ class OutputFolder:
     Args:
         folder: to write to, made where missing.
         stream: the scans, for the frame of the trajectories.
+        stack: closes the files of lines.
 
     Raises:
         InputError: the folder holds a trajectory already.
     """
 
-    def __init__(self, folder: Path, stream: ScanStream) -> None:
+    def __init__(self, folder: Path, stream: ScanStream, stack: ExitStack) -> None:
         self.folder, self.stream = folder, stream
-        self._files, self._written = ExitStack(), 0
+        self._stack, self._written = stack, 0
         if (folder / TRAJECTORY).exists():
             raise InputError(f"{folder}: holds a trajectory already; choose another --out")
 
@@ -154,7 +155,7 @@ class OutputFolder:
             self.folder.mkdir(parents=True, exist_ok=True)
             # Line by line, so that a run that is killed leaves no half of one.
             self._kitti, self._tum, self._steps = (
-                self._files.enter_context((self.folder / name).open("w", buffering=1))
+                self._stack.enter_context((self.folder / name).open("w", buffering=1))
                 for name in (TRAJECTORY, TUM, STEPS)
             )
         except OSError as error:
@@ -188,10 +189,6 @@ class OutputFolder:
         points = [points for _, points in statistics.sample.items]
         title = f"{self.stream.name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"
         map_figure(title, poses, points).savefig(self.folder / MAP, dpi=150)
-
-    def close(self) -> None:
-        """Ends the files of lines."""
-        self._files.close()
 
 
 def format_summary(summary: Summary) -> str:

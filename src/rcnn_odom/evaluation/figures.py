@@ -1,6 +1,6 @@
 """The figures of the paper: trajectories, and the motion of each frame."""
 
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -15,6 +15,14 @@ TRUTH, ESTIMATE = "tab:blue", "tab:red"
 """The paper's colours."""
 
 
+def new_figure(width: float, height: float, **panels: Any) -> tuple["Figure", Any]:
+    """An empty figure, in inches, and its axes: what ``Figure.subplots`` makes of the panels."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(width, height), layout="constrained")
+    return figure, figure.subplots(**panels)
+
+
 def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figure":
     """Estimate over truth, seen from above (paper fig. 4).
 
@@ -22,12 +30,10 @@ def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "F
         title: above the axes.
         truth, estimate: laser poses (N, 4, 4) in metres, each laid at its own first pose.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7, 6), layout="constrained")
+    figure, axes = new_figure(7, 6)
     # Driving up the page, left turns to the left.
     seen = ((np.linalg.inv(poses[0]) @ poses)[:, :2, 3] @ ((0, 1), (-1, 0)) for poses in (truth, estimate))
-    draw_trajectory(figure.subplots(), title, *seen)
+    draw_trajectory(axes, title, *seen)
     return figure
 
 
@@ -49,11 +55,8 @@ def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figur
         title: above the axes.
         truth, estimate: motions (N, 2) in metres and radians.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 6), layout="constrained")
+    figure, panels = new_figure(11, 6, nrows=2, sharex=True)
     figure.suptitle(title)
-    panels = figure.subplots(2, 1, sharex=True)
     labels = ("heading change (degrees)", "distance (m)")
     for axes, column, label in zip(panels, (1, 0), labels, strict=True):
         for motions, colour, name in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
@@ -71,18 +74,18 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
 
     Args:
         title: above the axes.
-        ratios: absolute errors of distance and heading over their deviations, (N, 2).
+        ratios: absolute errors of distance and heading over their deviations, (N, 2); nan where unknown.
     """
-    from matplotlib.figure import Figure
     from scipy.stats import halfnorm
 
-    figure = Figure(figsize=(7, 5), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_figure(7, 5)
     times = np.linspace(0, 4, 200)
     axes.plot(times, 100 * halfnorm.cdf(times), "k--", label="normal errors", linewidth=1)
     for column, colour, label in ((0, TRUTH, "distance"), (1, ESTIMATE, "heading")):
-        share = np.searchsorted(np.sort(ratios[:, column]), times, side="right") / len(ratios)
-        axes.plot(times, 100 * share, color=colour, label=label, linewidth=1.5)
+        known = np.sort(ratios[np.isfinite(ratios[:, column]), column])
+        if len(known):
+            share = np.searchsorted(known, times, side="right") / len(known)
+            axes.plot(times, 100 * share, color=colour, label=label, linewidth=1.5)
     axes.set(xlabel="estimated standard deviations", ylabel="frames whose error is within them (%)")
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
@@ -101,10 +104,8 @@ def map_figure(title: str, poses: FloatArray, points: list[npt.NDArray[np.float3
         points: of each scan (P, 2), in the frame of the poses, metres.
     """
     from matplotlib.colors import LogNorm
-    from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(9, 9), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_figure(9, 9)
     x, y = np.concatenate(points).T
     low, high = (np.array([f(-y, initial=0), f(x, initial=0)]) for f in (np.min, np.max))
     # As many cells as the picture has dots, so that a wall is as thin as it can be shown.
@@ -113,9 +114,8 @@ def map_figure(title: str, poses: FloatArray, points: list[npt.NDArray[np.float3
     limits = [(low[0], low[0] + cells[0] * cell), (low[1], low[1] + cells[1] * cell)]
     counts, *_ = np.histogram2d(-y, x, bins=cells, range=limits)
     if counts.any():
-        shown = np.ma.masked_equal(counts.T, 0)
         axes.imshow(
-            shown,
+            np.ma.masked_equal(counts.T, 0),
             cmap="Greys",
             norm=LogNorm(0.5, counts.max()),
             origin="lower",

@@ -113,16 +113,11 @@ def _frame_error(drive: Drive, steps: Steps, lengths: Sequence[float], name: str
 
 def _frame_metrics(quantity: str, unit: str) -> list[Metric]:
     mae, bias, largest = (f"{quantity}_{kind}_{unit}" for kind in ("mae", "bias", "max"))
-
-    def compute(name: str) -> Callable[[Drive, Steps, Sequence[float]], float]:
-        return partial(_frame_error, name=name)
-
+    of_mae, of_bias, of_largest = (partial(_frame_error, name=name) for name in (mae, bias, largest))
     return [
-        Metric(
-            mae, f"{quantity}, mean abs", unit, "lower", compute(mae), "frames", digits=4, in_training=True
-        ),
-        Metric(bias, f"{quantity}, signed", unit, "zero", compute(bias), "frames", digits=4),
-        Metric(largest, f"{quantity}, largest", unit, "lower", compute(largest), "max", digits=3),
+        Metric(mae, f"{quantity}, mean abs", unit, "lower", of_mae, "frames", digits=4, in_training=True),
+        Metric(bias, f"{quantity}, signed", unit, "zero", of_bias, "frames", digits=4),
+        Metric(largest, f"{quantity}, largest", unit, "lower", of_largest, "max", digits=3),
     ]
 
 
@@ -174,7 +169,9 @@ def score_metrics(drive: Drive, steps: Steps, lengths: Sequence[float]) -> dict[
     """
     values = {name: metric.compute(drive, steps, lengths) for name, metric in all_metrics().items()}
     return {
-        name: None if value is None or not np.isfinite(value) else value for name, value in values.items()
+        # Plain floats, also of a metric that gives numpy's, which JSON does not know.
+        name: None if value is None or not np.isfinite(value) else float(value)
+        for name, value in values.items()
     }
 
 

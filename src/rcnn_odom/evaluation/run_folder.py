@@ -1,6 +1,7 @@
 """What is in a run's folder, and how it is read again; for those who train and for those who compare."""
 
 import json
+import os
 from collections.abc import Collection
 from pathlib import Path
 from typing import Any
@@ -24,6 +25,11 @@ def flat(settings: Settings, prefix: str = "") -> Settings:
     for key, value in settings.items():
         pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return pairs
+
+
+def home_of(run: Path) -> Path:
+    """The folder where a run really is: ``outputs/latest`` only holds links to what is in it."""
+    return Path(os.path.relpath((run / CONFIG).resolve().parent)) if (run / CONFIG).is_symlink() else run
 
 
 def read_settings(run: Path, groups: Collection[str] = ("data", "model", "trainer")) -> Settings:
@@ -56,7 +62,10 @@ def _upgrade(data: Settings, model: Settings) -> None:
     """
     reader = data.get("reader")
     if isinstance(reader, dict) and "_target_" in reader:
-        data["reader"] = {"format": reader.pop("_target_").split(".")[-2], **reader}
+        data["reader"] = {
+            "format": str(reader.pop("_target_")).removesuffix(".load").split(".")[-1],
+            **reader,
+        }
         if "apply" in data:
             model.setdefault("apply", data["apply"])
 

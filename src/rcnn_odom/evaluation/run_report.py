@@ -100,7 +100,9 @@ def _in_two_numbers(name: str, steps: Mapping[str, Steps], apply: Apply) -> dict
     """Steps cut to what two numbers can say, comparable with the floor; nothing where they say no more."""
     if max(_sideways(every.values, apply) for every in steps.values()) < SIDEWAYS:
         return {}
-    cut = {drive: Steps.certain_of_nothing(restate(every.values, apply)) for drive, every in steps.items()}
+    cut = {
+        drive: Steps.with_unknown_covariance(restate(every.values, apply)) for drive, every in steps.items()
+    }
     return {f"{name}_two_numbers": cut}
 
 
@@ -126,7 +128,7 @@ def baseline_steps(mean_step: FloatArray | None, drives: Sequence[Drive]) -> dic
     known = {drive: relative_steps(poses) for drive, poses in wheels.items() if poses is not None}
     if len(known) == len(drives):
         baselines["wheel_odometry"] = {
-            drive: Steps.certain_of_nothing(values) for drive, values in known.items()
+            drive: Steps.with_unknown_covariance(values) for drive, values in known.items()
         }
     return baselines
 

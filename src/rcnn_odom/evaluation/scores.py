@@ -33,7 +33,7 @@ def score(drive: Drive, steps: Steps, lengths: Sequence[float], apply: Apply = "
         ``drift`` of the estimate and ``floor``, the drift of the true steps cut to two numbers, both as the
         command line prints them; the errors of single frames; and every other metric.
     """
-    floor = Steps.certain_of_nothing(restate(drive.steps, apply))
+    floor = Steps.with_unknown_covariance(restate(drive.steps, apply))
     return {
         **score_metrics(drive, steps, lengths),
         "frames": len(drive),
@@ -80,15 +80,15 @@ def in_deviations(steps: Steps, truth: FloatArray) -> tuple[FloatArray, FloatArr
         truth: true steps (N-1, 3).
 
     Returns:
-        Absolute errors over deviations, and the deviations (metres, radians), of the K steps whose
-        deviations are known, each (K, 2).
+        Absolute errors over deviations, and the deviations (metres, radians), each (K, 2), of the K steps
+        of which one deviation at least is known; the other may be nan.
     """
     half = steps.values[:, 2] / 2
     along = np.stack([np.cos(half), np.sin(half)], axis=1)
     distance = np.einsum("ni,nij,nj->n", along, steps.covariances[:, :2, :2], along)
     deviations = np.sqrt(np.stack([distance, steps.covariances[:, 2, 2]], axis=1))
     errors = np.abs(motion_errors(motions_of(steps.values), motions_of(truth)))
-    known = np.isfinite(deviations).all(1)
+    known = np.isfinite(deviations).any(1)
     return errors[known] / deviations[known], deviations[known]
 
 
@@ -101,21 +101,17 @@ def coverage(steps: Steps, truth: FloatArray) -> Report | None:
 
     Returns:
         Shares under ``distance`` and ``heading``, there under ``1`` and ``2``: 0.683 and 0.954 for normal
-        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``. None where no
-        step's deviations are known.
+        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``. Without
+        those of the distance where no deviation of a distance is known; None where none is at all.
     """
     ratios, deviations = in_deviations(steps, truth)
-    if not len(ratios):
-        return None
-    distance, heading = deviations.mean(0)
-    return {
-        **{
-            name: {str(times): float((ratios[:, column] <= times).mean()) for times in (1, 2)}
-            for column, name in enumerate(("distance", "heading"))
-        },
-        "distance_m": float(distance),
-        "heading_deg": float(np.rad2deg(heading)),
-    }
+    report: Report = {}
+    for column, (name, unit, scale) in enumerate((("distance", "m", 1), ("heading", "deg", 180 / np.pi))):
+        known = np.isfinite(deviations[:, column])
+        if known.any():
+            within = {str(times): float((ratios[known, column] <= times).mean()) for times in (1, 2)}
+            report |= {name: within, f"{name}_{unit}": float(scale * deviations[known, column].mean())}
+    return report or None
 
 
 def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply: Apply = "end") -> Report:
@@ -215,8 +211,9 @@ def coverage_table(reports: Mapping[str, Report]) -> str:
     rows = [[title, *(f"{name} {times}" for name, times in columns), "mean, m", "mean, deg"]]
     rows.append(["of normal errors", *["68.3", "95.4"] * 2, "", ""])
     for sequence, report in reports.items():
-        shares = [f"{100 * report[name][times]:.1f}" for name, times in columns]
-        rows.append([sequence, *shares, f"{report['distance_m']:.3f}", f"{report['heading_deg']:.3f}"])
+        shares = [f"{100 * report[name][times]:.1f}" if name in report else "-" for name, times in columns]
+        means = [f"{report[name]:.3f}" if name in report else "-" for name in ("distance_m", "heading_deg")]
+        rows.append([sequence, *shares, *means])
     return aligned(rows)
 
 

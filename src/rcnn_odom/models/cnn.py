@@ -19,7 +19,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, motions_of
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.losses import classification_loss, regression_loss
-from rcnn_odom.models.trained import Batch, State, TrainedModel, chunks_of_pairs
+from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel, chunks_of_pairs
 from rcnn_odom.models.two_numbers import TURN_FRACTION
 from rcnn_odom.models.uncertainty import Uncertainty, two_number_errors
 from rcnn_odom.options import option
@@ -65,8 +65,8 @@ class RotationClasses:
         return (heading.abs() > self.count / 2 * self.width).sum()
 
 
-@dataclass(frozen=True, kw_only=True)
-class CNNOptions:
+@dataclass(kw_only=True)
+class CNNOptions(Recipe):
     """What ``conf/model`` sets; the comments there say what each means."""
 
     kernel_size: int = option(fits=lambda size: size > 0 and size % 2 == 1, wanted="odd; the paper uses 3")
@@ -77,10 +77,6 @@ class CNNOptions:
     beta: float = option(above=0)
     per_sample_norm: bool
     dropout: float = option(least=0, below=1)
-    epochs: int = option(above=0)
-    learning_rate: float = option(above=0)
-    window: int = option(above=0)
-    batch_size: int = option(above=0)
 
 
 class Encoder(nn.Module):

@@ -5,7 +5,7 @@ A model is one file in this package and one in ``conf/model``; docs/extending.md
 
 import inspect
 from abc import ABC, abstractmethod
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, is_dataclass
 from typing import Any, ClassVar, Protocol
 
 import numpy as np
@@ -82,6 +82,8 @@ class Model(ABC):
 
 NEEDED = ("name", "Options", "estimate", "stepper")
 NEEDED_TO_TRAIN = ("forward", "loss")
+RECIPE = {"epochs", "learning_rate", "window", "batch_size"}
+"""Options of every training, see :class:`rcnn_odom.models.trained.Recipe`."""
 
 
 def check_model(name: str, model: Any) -> None:
@@ -90,31 +92,40 @@ def check_model(name: str, model: Any) -> None:
     Raises:
         InputError: a part of the contract is missing; the message says which.
     """
-    needed = NEEDED + (NEEDED_TO_TRAIN if getattr(model, "trains", False) else ())
+    trains = getattr(model, "trains", False)
+    needed = NEEDED + (NEEDED_TO_TRAIN if trains else ())
     abstract = getattr(model, "__abstractmethods__", ())
     missing = [part for part in needed if not hasattr(model, part) or part in abstract]
-    if missing or not (inspect.isclass(model) and issubclass(model, Model)):
-        what = f"lacks {', '.join(missing)}" if missing else f"is no subclass of {Model.__name__}"
-        raise InputError(f"model {name}: {what}; docs/extending.md says what a model has")
-    if model.name != name:
-        raise InputError(f"model {name}: its class is named {model.name}; both must be the same")
+    if not missing and is_dataclass(model.Options) and trains:
+        given = {each.name for each in fields(model.Options)}
+        missing = [f"the option {each}" for each in sorted(RECIPE - given)]
+    if missing:
+        problem = f"lacks {', '.join(missing)}"
+    elif not (inspect.isclass(model) and issubclass(model, Model)):
+        problem = f"is no subclass of {Model.__name__}"
+    elif not is_dataclass(model.Options):
+        problem = "has Options that are no dataclass"
+    elif model.name != name:
+        problem = f"its class is named {model.name}; both must be the same"
+    else:
+        return
+    raise InputError(f"model {name}: {problem}; docs/extending.md says what a model has")
 
 
 def all_models() -> dict[str, type[Model]]:
     """Every model by its name; imports all of them, and so torch.
 
     Raises:
-        InputError: two have the same name, or one that a package adds lacks a part.
+        InputError: two have the same name, or one lacks a part.
     """
     built_in: dict[str, type[Model]] = {}
     for module in modules_in("rcnn_odom.models"):
         for member in vars(module).values():
-            own = (
-                inspect.isclass(member) and issubclass(member, Model) and member.__module__ == module.__name__
-            )
-            if own and "name" in vars(member):
+            is_model = inspect.isclass(member) and issubclass(member, Model)
+            if is_model and member.__module__ == module.__name__ and "name" in vars(member):
                 if member.name in built_in:
                     raise InputError(f"two models are called {member.name}; rename that of {module.__name__}")
+                check_model(member.name, member)
                 built_in[member.name] = member
     return collect("model", built_in, check_model)
 

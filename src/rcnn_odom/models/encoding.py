@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.options import option
 from rcnn_odom.recordings.scan import Scan
 
 
@@ -21,9 +22,9 @@ class Sensor:
         max_range: metres; readings at or beyond it are absent returns, not walls.
     """
 
-    resolution_deg: float = 0.1
-    field_of_view_deg: float = 360.0
-    max_range: float = 80.0
+    resolution_deg: float = option(default=0.1, above=0)
+    field_of_view_deg: float = option(default=360.0, above=0)
+    max_range: float = option(default=80.0, above=0)
 
     def __post_init__(self) -> None:
         steps = self.field_of_view_deg / self.resolution_deg if self.resolution_deg > 0 else 0.0

@@ -41,7 +41,7 @@ while the gate is open the few walls across a street must pull as well as the ma
 SETTLED = np.array([1e-4, 1e-4, 1e-5])
 """Metres and radians: a change of the step below it is the last."""
 DAMPING = 1e-4
-"""Beside a mean square of 1: what the lines do not say does not run away."""
+"""Beside a mean square of 1: damping keeps unconstrained directions from diverging."""
 
 FEWEST_PAIRS = 15
 LEAST_SHARE, DOUBTFUL_SHARE = 0.4, 0.6
@@ -197,7 +197,7 @@ class ICP(Model):
         stepper = self.stepper()
         matches = [stepper.match(*pair) for pair in pairwise(drive.scans)]
         self.failures[drive.name] = sum(match.failed for match in matches)
-        return Steps.certain_of_nothing([match.step for match in matches])
+        return Steps.with_unknown_covariance([match.step for match in matches])
 
     def stepper(self) -> "ICPStepper":
         """The same one pair of scans after the other."""

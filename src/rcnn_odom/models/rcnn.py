@@ -26,14 +26,14 @@ from rcnn_odom.options import option
 log = logging.getLogger(__name__)
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class FirstStageOptions(CNNOptions):
     """Of the classifying CNN that is trained first."""
 
     variant: str = option(choices=(CNNClassification.name,))
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass(kw_only=True)
 class RCNNOptions(CNNOptions):
     """What ``conf/model`` sets beside the CNN's options."""
 

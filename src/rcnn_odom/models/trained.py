@@ -36,10 +36,10 @@ class Recipe:
         batch_size: windows in a batch.
     """
 
-    epochs: int = option(least=1)
+    epochs: int = option(above=0)
     learning_rate: float = option(above=0)
-    window: int = option(least=1)
-    batch_size: int = option(least=1)
+    window: int = option(above=0)
+    batch_size: int = option(above=0)
 
 
 def chunks_of_pairs(scans: Tensor) -> Iterator[Tensor]:

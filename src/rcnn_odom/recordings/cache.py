@@ -8,7 +8,6 @@ import re
 import time
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
 from typing import IO, Any, Protocol
 
 import numpy as np
@@ -228,8 +227,7 @@ class _PartialFile:
                     file.write(_checksum(file, file.seek(0, os.SEEK_END)).digest())
                     file.flush()
                     os.fsync(file.fileno())
-            if not self.missing:
-                self.partial.replace(self.path)
+                    self.partial.replace(self.path)
         except OSError as error:
             raise self._refusal(error) from error
 
@@ -240,7 +238,5 @@ class _PartialFile:
             "make room there, or set outputs= to another place"
         )
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.partial.unlink(missing_ok=True)

@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
-from typing import IO, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -34,7 +34,7 @@ READER_VERSION = 1
 """Raised whenever the same file would give other scans."""
 
 SUFFIXES = tuple(kind + packing for kind in ("", ".log", ".clf") for packing in ("", ".gz", ".bz2"))
-READ = ("FLASER", "ROBOTLASER1")
+OPENERS = {".gz": gzip.open, ".bz2": bz2.open}
 REFERENCE_COLUMNS = ("raw_scan_index", "ref_x", "ref_y", "ref_theta")
 
 
@@ -127,13 +127,13 @@ def _laser_lines(
     first_kind = None
     for number, text in _lines_of(path):
         kind = text.split(None, 1)[0] if text.strip() else ""
-        if kind not in READ or (not strict and first_kind not in (None, kind)):
+        if kind not in PARSERS or (not strict and first_kind not in (None, kind)):
             if "LASER" in kind and not kind.startswith("#"):
                 others[f"{kind} lines"] += 1
             continue
         broken = f"{path}:{number}: broken {kind} line"
         try:
-            line = _parse(text, field_of_view_deg)
+            line = PARSERS[kind](text.split(), np.deg2rad(field_of_view_deg))
         except ValueError as error:
             if strict:
                 raise InputError(f"{broken} ({error}); correct or remove it") from error
@@ -152,11 +152,6 @@ def _laser_lines(
         raise InputError(
             f"{path}: no FLASER or ROBOTLASER1 line in it{found}; convert the log to one of them"
         )
-
-
-def _parse(text: str, field_of_view_deg: float) -> "LaserLine":
-    fields = text.split()
-    return _parse_flaser(fields, field_of_view_deg) if fields[0] == "FLASER" else _parse_robotlaser(fields)
 
 
 class LaserLine(NamedTuple):
@@ -225,28 +220,20 @@ def _find_log(root: Path, name: str) -> Path:
     return found[0]
 
 
-def _open(path: Path) -> IO[str]:
-    # A byte that is no text becomes a character that is no number, and then an error with its line.
-    if path.suffix == ".gz":
-        return cast(IO[str], gzip.open(path, "rt", encoding="utf-8", errors="replace"))
-    if path.suffix == ".bz2":
-        return cast(IO[str], bz2.open(path, "rt", encoding="utf-8", errors="replace"))
-    return path.open(encoding="utf-8", errors="replace")
-
-
 def _lines_of(path: Path) -> Iterator[tuple[int, str]]:
+    unpack: Any = OPENERS.get(path.suffix, open)
     try:
-        with _open(path) as stream:
+        # A byte that is no text becomes a character that is no number, and then an error with its line.
+        with unpack(path, "rt", encoding="utf-8", errors="replace") as stream:
             yield from enumerate(stream, start=1)
     except (EOFError, OSError, zlib.error) as error:
         raise InputError(f"{path}: cannot be read to its end ({error}); download it again") from error
 
 
-def _parse_flaser(fields: list[str], field_of_view_deg: float) -> LaserLine:
+def _parse_flaser(fields: list[str], field_of_view: float) -> LaserLine:
     count = _count(fields, 1)
     _need_fields(fields, 2 + count + 9, count)
     pose = _finite(fields[2 + count : 9 + count])
-    field_of_view = np.deg2rad(field_of_view_deg)
     return LaserLine(
         kind=fields[0],
         readings=np.array([float(word) for word in fields[2 : 2 + count]]),
@@ -259,7 +246,7 @@ def _parse_flaser(fields: list[str], field_of_view_deg: float) -> LaserLine:
     )
 
 
-def _parse_robotlaser(fields: list[str]) -> LaserLine:
+def _parse_robotlaser(fields: list[str], _: float) -> LaserLine:
     count = _count(fields, 8)
     _need_fields(fields, 10 + count, count, exact=False)
     remissions = int(fields[9 + count])
@@ -276,6 +263,9 @@ def _parse_robotlaser(fields: list[str]) -> LaserLine:
         robot=poses[3:],
         stamp=_finite(fields[-3:-2])[0],
     )
+
+
+PARSERS = {"FLASER": _parse_flaser, "ROBOTLASER1": _parse_robotlaser}
 
 
 def _spacing(field_of_view: float, count: int) -> float:
@@ -343,13 +333,14 @@ def _check_stamps(stamps: FloatArray) -> list[str]:
 def _name_truth(lines: list[LaserLine]) -> list[str]:
     difference = np.array([line.laser for line in lines]) - np.array([line.robot for line in lines])
     difference[:, 2] = wrap_angle(difference[:, 2])
-    notes = ["truth: the log's laser pose"]
-    if np.abs(difference).max() < 1e-6:
-        notes.append(
-            "the log's laser pose equals its odometry everywhere: unless the log was corrected, the truth is "
-            "just the wheel odometry"
-        )
-    return notes
+    truth = "truth: the log's laser pose"
+    if np.abs(difference).max() >= 1e-6:
+        return [truth]
+    warning = (
+        "the log's laser pose equals its odometry everywhere: unless the log was corrected, the truth is "
+        "just the wheel odometry"
+    )
+    return [truth, warning]
 
 
 def _find_reference(reference: Path, name: str) -> Path:
@@ -368,8 +359,7 @@ def _find_reference(reference: Path, name: str) -> Path:
 def _read_truth(path: Path, scans: int) -> tuple[FloatArray, list[str]]:
     """Poses (scans, 4, 4) of a reference, nan where it has none, and notes on them."""
     planar = _read_reference(path, scans)
-    unknown = np.isnan(planar[:, 0])
-    poses = planar_to_poses(planar)
+    poses, unknown = planar_to_poses(planar), np.isnan(planar[:, 0])
     poses[unknown] = np.nan
     return poses, [f"truth: {path.name}", f"{int(unknown.sum())} scans without truth"]
 

@@ -7,6 +7,7 @@ bool`` and ``stream(path, **options) -> ScanStream`` make it one to stream.
 from collections.abc import Mapping
 from functools import partial
 from inspect import signature
+from itertools import chain
 from pathlib import Path
 from types import ModuleType
 from typing import Any, Protocol
@@ -19,18 +20,20 @@ from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.registry import choose, collect, modules_in
 
+WHAT, PACKAGE = "recording format", "rcnn_odom.recordings"
+ASKED_LAST = ("carmen", "simulated")
+"""One knows any file; the other streams nothing and takes a second to be imported."""
+
 
 def all_formats() -> dict[str, ModuleType]:
-    """The formats by their names, in the order in which they are asked whether they know a recording.
+    """The formats by their names; imports all of them.
 
     Raises:
         InputError: one that another package adds has the name of another, or lacks a part.
     """
-    modules = {module.__name__.rpartition(".")[2]: module for module in modules_in("rcnn_odom.recordings")}
+    modules = {module.__name__.rpartition(".")[2]: module for module in modules_in(PACKAGE)}
     own = {name: module for name, module in modules.items() if {"load", "recognises"} & set(dir(module))}
-    formats = collect("recording format", own, _check)
-    formats["carmen"] = formats.pop("carmen")  # last, since it knows any file
-    return {name: formats[name] for name in sorted(formats, key=lambda name: name in own)}
+    return collect(WHAT, own, _check)
 
 
 def _check(name: str, module: Any) -> None:
@@ -50,7 +53,7 @@ def find_format(name: str) -> ModuleType:
     Raises:
         InputError: there is none, or it has no ``load``.
     """
-    found: ModuleType = choose("recording format", name, all_formats())
+    found: ModuleType = choose(WHAT, name, all_formats())
     if not hasattr(found, "load"):
         raise InputError(
             f"recording format {name} has no load, so that it only streams; choose another data.reader.format"
@@ -92,7 +95,7 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a KITTI sequence, a CARMEN log or a ROS bag")
-    for found in all_formats().values():
+    for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, ASKED_LAST)):
         if hasattr(found, "recognises") and found.recognises(path):
             taken = signature(found.stream).parameters
             given = {name: value for name, value in (options or {}).items() if value is not None}

@@ -13,10 +13,11 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, change_frame
+from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
-from rcnn_odom.recordings.trajectory import is_rotation, read_kitti
+from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_kitti, read_lines
 
 READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
@@ -66,7 +67,11 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
     camera_from_laser = read_calibration(folder / "calib.txt")
     stamps = _read_stamps(folder / "times.txt")
     camera_poses = _read_poses(root / "poses" / f"{name}.txt")
-    _need_same_number(folder, len(scans), len(stamps), len(camera_poses))
+    if not len(scans) == len(stamps) == len(camera_poses):
+        raise InputError(
+            f"{folder}: {len(scans)} scans in velodyne/, {len(stamps)} lines in times.txt and "
+            f"{len(camera_poses)} in the poses file; all three must agree, so copy the incomplete one again"
+        )
     reader, chosen = _choose_ring(scans, stamps, ring)
     key = f"kitti {READER_VERSION} {reader.ring} {fingerprint_of_files}"
     return Recording(
@@ -126,6 +131,13 @@ def _choose_ring(scans: list[Path], stamps: FloatArray, ring: int | None) -> tup
     elevation = float(elevations[ring])
     chosen = f"ring {ring} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"
     return RingReader(tuple(map(str, scans)), ring, elevation, tuple(stamps.tolist())), chosen
+
+
+@dataclass(kw_only=True)
+class Options:
+    """What ``conf/data/kitti.yaml`` sets beside what all recordings have."""
+
+    ring: int | None = option(least=0, wanted="null or a whole number, not negative")
 
 
 @dataclass(frozen=True)
@@ -197,11 +209,11 @@ def read_calibration(path: str | Path) -> FloatArray:
     Raises:
         InputError: there is no such file, no ``Tr:`` line in it, or not 12 numbers on the line.
     """
-    path = Path(path)
-    for number, line in enumerate(_read_lines(path, "the calibration"), start=1):
+    for number, line in enumerate(read_lines(path, "give the odometry data's own"), start=1):
         if line.startswith("Tr:"):
             tr = np.eye(4)
-            tr[:3] = np.reshape(_numbers(path, number, line[3:], 12), (3, 4))
+            words = line[3:].split()
+            tr[:3] = np.reshape(numbers(f"{path}:{number}", words, 12, "Tr has 12 finite numbers"), (3, 4))
             if not is_rotation(tr[:3, :3]):
                 raise InputError(f"{path}:{number}: Tr holds no rotation; restore the original file")
             return tr
@@ -283,23 +295,6 @@ def _need_folder(folder: Path, advice: str) -> None:
         raise InputError(f"{folder}: no such folder; {advice}")
 
 
-def _need_same_number(folder: Path, scans: int, stamps: int, poses: int) -> None:
-    if not scans == stamps == poses:
-        raise InputError(
-            f"{folder}: {scans} scans in velodyne/, {stamps} lines in times.txt and {poses} in the poses "
-            "file; all three must agree, so copy the incomplete one again"
-        )
-
-
-def _read_lines(path: Path, what: str) -> list[str]:
-    try:
-        return path.read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
-    except FileNotFoundError as error:
-        raise InputError(f"{path}: no such file; {what} should be there") from error
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read ({error.strerror})") from error
-
-
 def _read_poses(path: Path) -> FloatArray:
     if not path.is_file():
         raise InputError(f"{path}: no such file; the ground truth is needed (KITTI has none for 11 to 21)")
@@ -307,18 +302,6 @@ def _read_poses(path: Path) -> FloatArray:
 
 
 def _read_stamps(path: Path) -> FloatArray:
-    lines = _read_lines(path, "the time stamps of every scan")
-    return np.array([_numbers(path, number, line, 1)[0] for number, line in enumerate(lines, start=1)])
-
-
-def _numbers(path: Path, number: int, text: str, count: int) -> list[float]:
-    try:
-        values = [float(word) for word in text.split()]
-    except ValueError:
-        values = []
-    if len(values) != count or not np.isfinite(values).all():
-        raise InputError(
-            f"{path}:{number}: expected {count} finite number{'s' * (count > 1)}, found {len(text.split())} "
-            f"words, '{text.strip()[:40]}'; correct the line"
-        )
-    return values
+    lines = enumerate(read_lines(path, "give the time stamps of all scans"), start=1)
+    wanted = "a time stamp is 1 finite number"
+    return np.ravel([numbers(f"{path}:{number}", line.split(), 1, wanted) for number, line in lines])

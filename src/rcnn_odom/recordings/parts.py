@@ -11,6 +11,9 @@ from rcnn_odom.recordings.recording import Drive
 
 log = logging.getLogger(__name__)
 
+FRACTION = r"(?:\d+\.?\d*|\.\d+)?"
+"""A number without a sign, or nothing."""
+
 
 def parse_part(name: str) -> tuple[str, float, float]:
     """``NAME`` or ``NAME[a:b]`` -> name and the fractions of the recording where the part lies.
@@ -21,15 +24,12 @@ def parse_part(name: str) -> tuple[str, float, float]:
     >>> parse_part("10[0.25:]")
     ('10', 0.25, 1.0)
     """
-    match = re.fullmatch(r"(.+?)\[([\d.]*):([\d.]*)\]", name)
+    match = re.fullmatch(rf"(.+?)\[({FRACTION}):({FRACTION})\]", name)
     if match is None:
         if "[" in name:
             raise InputError(f"sequence {name!r}: a part is written NAME[0.0:0.85], fractions of the drive")
         return name, 0.0, 1.0
-    try:
-        start, stop = float(match[2] or 0), float(match[3] or 1)
-    except ValueError:
-        start, stop = 1.0, 0.0
+    start, stop = float(match[2] or 0), float(match[3] or 1)
     if not 0 <= start < stop <= 1:
         raise InputError(f"sequence {name!r}: a part needs two fractions between 0 and 1, the smaller first")
     return match[1], start, stop

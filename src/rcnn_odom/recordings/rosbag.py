@@ -75,8 +75,7 @@ def _choose(path: Path, topic: str | None, topics: dict[str, str | None]) -> str
     lasers = sorted(name for name, kind in topics.items() if kind == LASER_SCAN)
     if topic is None and len(lasers) == 1:
         return lasers[0]
-    if topic in lasers:
-        assert topic is not None
+    if topic is not None and topic in lasers:
         return topic
     if lasers:
         wrong = f"no LaserScan topic {topic}" if topic else "several LaserScan topics"
@@ -97,8 +96,6 @@ def _scans(bag: Any, topic: str, path: Path, skipped: Counter[str]) -> Iterator[
                 continue
             yield scan
             read += 1
-    except InputError:
-        raise
     except Exception as error:
         raise InputError(
             f"{path}: breaks off after {read} scans ({_reason(error)}); what came before is kept"

@@ -18,6 +18,7 @@ from scipy.spatial import cKDTree
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, planar_to_poses
+from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.simulation.indoor.building import Building, plan_building
@@ -73,6 +74,29 @@ MOUNTING_DEG, MOUNTING_HEIGHT = 0.2, 0.03
 """Standard deviation of how the laser sits on this drive's car: pitch and roll, and metres."""
 
 
+@dataclass(kw_only=True)
+class RealismOptions:
+    """``data.realism``."""
+
+    tilt: bool
+    movers: bool
+    missing: bool
+
+
+@dataclass(kw_only=True)
+class Options:
+    """What ``conf/data/simulated.yaml`` and ``indoor.yaml`` set beside what all recordings have."""
+
+    realism: RealismOptions
+    fresh_worlds: bool
+    keep_worlds: bool
+    vary_pace: bool
+    world: str = option(choices=("street", "indoor"))
+    scale: str = option(choices=("small", "full"))
+    frames: int | None = option(above=0)
+    world_seed: int = option(least=0, below=2**32, wanted="a whole number, not negative")
+
+
 def load(
     name: str,
     *,
@@ -123,17 +147,14 @@ def load(
 
 
 def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> None:
-    wrong = None
-    if frames is not None and frames < 2:
-        wrong = f"a drive has at least 2 frames, not {frames}; change data.frames"
-    elif seed < 0:
-        wrong = f"a seed is 0 or more, not {seed}; change data.world_seed"
-    elif world not in ("street", "indoor"):
-        wrong = f"no world {world!r}; data.world is street or indoor"
-    elif scale not in FRAMES:
-        wrong = f"no scale {scale!r}; data.scale is small or full"
-    if wrong:
-        raise InputError(f"simulated sequence {name}: {wrong}")
+    for fits, advice in (
+        (frames is None or frames >= 2, f"a drive has at least 2 frames, not {frames}; change data.frames"),
+        (seed >= 0, f"a seed is 0 or more, not {seed}; change data.world_seed"),
+        (world in ("street", "indoor"), f"no world {world!r}; data.world is street or indoor"),
+        (scale in FRAMES, f"no scale {scale!r}; data.scale is small or full"),
+    ):
+        if not fits:
+            raise InputError(f"simulated sequence {name}: {advice}")
 
 
 def _laser(name: str, world: str, given: dict[str, Any]) -> Laser:

@@ -33,14 +33,32 @@ def read_kitti(path: str | Path) -> FloatArray:
         InputError: the file cannot be read or is empty, or a line (which is named) does not hold
             12 finite numbers with a rotation among them.
     """
-    lines = _read_lines(path, "give a file with 12 numbers a line, one line a frame")
-    poses = np.tile(np.eye(4), (len(lines), 1, 1))
-    for number, line in enumerate(lines, start=1):
-        poses[number - 1, :3] = _parse_row(line, f"{path}:{number}")
+    lines = read_lines(path, "give a file with 12 numbers a line, one line a frame")
+    rows = [
+        numbers(f"{path}:{number}", line.split(), 12, "a KITTI pose has 12 finite numbers")
+        for number, line in enumerate(lines, start=1)
+    ]
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3] = np.reshape(rows, (-1, 3, 4))
+    for number, pose in enumerate(poses, start=1):
+        if not is_rotation(pose[:3, :3]):
+            raise InputError(
+                f"{path}:{number}: the 3x3 part of a pose must be a rotation, and this one is not; correct "
+                "the line"
+            )
     return poses
 
 
-def _read_lines(path: str | Path, wanted: str) -> list[str]:
+def read_lines(path: str | Path, wanted: str) -> list[str]:
+    """The lines of a text file, one at least.
+
+    Args:
+        path: of the file.
+        wanted: what it should be, for the message.
+
+    Raises:
+        InputError: it cannot be read or is empty.
+    """
     try:
         lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
     except OSError as error:
@@ -50,24 +68,27 @@ def _read_lines(path: str | Path, wanted: str) -> list[str]:
     return lines
 
 
-def _parse_row(line: str, where: str) -> FloatArray:
-    fields = line.split()
-    if len(fields) != 12:
-        raise InputError(
-            f"{where}: found {len(fields)} fields where a KITTI pose has 12 numbers; correct the line"
-        )
+def numbers(where: str, words: list[str], count: int, wanted: str) -> list[float]:
+    """The words of a line as so many finite numbers.
+
+    Args:
+        where: file and line, for the message.
+        words: of the line.
+        count: numbers that it must hold.
+        wanted: a sentence that says so.
+
+    Raises:
+        InputError: they are none, or another number of them.
+    """
     try:
-        row = np.array([float(field) for field in fields])
+        if len(words) != count:
+            raise ValueError(f"found {len(words)} fields")
+        values = [float(word) for word in words]
+        if not np.isfinite(values).all():
+            raise ValueError("found nan or inf")
     except ValueError as error:
-        raise InputError(f"{where}: not a KITTI pose of 12 numbers ({error}); correct the line") from error
-    if not np.isfinite(row).all():
-        raise InputError(f"{where}: a pose must be finite, found nan or inf; correct the line")
-    pose = row.reshape(3, 4)
-    if not is_rotation(pose[:, :3]):
-        raise InputError(
-            f"{where}: the 3x3 part of a pose must be a rotation, and this one is not; correct the line"
-        )
-    return pose
+        raise InputError(f"{where}: {error}, but {wanted}; correct the line") from error
+    return values
 
 
 def is_rotation(matrix: FloatArray) -> bool:
@@ -113,20 +134,11 @@ def read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
         InputError: the file cannot be read or holds no line, or a line (which is named) does not hold so
             many finite numbers.
     """
-    lines = _read_lines(path, wanted)
-    rows = []
-    for number, line in enumerate(lines):
-        if line.startswith("#"):
-            continue
-        try:
-            row = [float(word) for word in line.split()]
-        except ValueError:
-            row = []
-        if len(row) != columns or not np.isfinite(row).all():
-            raise InputError(
-                f"{path}:{number + 1}: found '{line.strip()[:40]}', but {wanted}; correct the line"
-            )
-        rows.append(row)
+    rows = [
+        numbers(f"{path}:{number}", line.split(), columns, wanted)
+        for number, line in enumerate(read_lines(path, wanted), start=1)
+        if not line.startswith("#")
+    ]
     if not rows:
         raise InputError(f"{path}: has comments alone; {wanted}")
     return np.array(rows)
@@ -246,11 +258,8 @@ def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
         InputError: the file cannot be read, has another header or no motion, or a line (which is named)
             is not the next frame with a finite number in each column.
     """
-    try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
-    except OSError as error:
-        raise InputError(f"{path}: cannot be read: {error.strerror}") from error
-    header = lines[0].split(",") if lines else []
+    lines = read_lines(path, "give a file of motions, as evaluate.py writes them")
+    header = lines[0].split(",")
     baselines = [name.removesuffix("_distance_m") for name in header[5::2]]
     methods = ["estimate", "true", *baselines]
     if header != _motion_columns(baselines) or len(set(methods)) < len(methods):
@@ -266,16 +275,8 @@ def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
 
 
 def _parse_motions(line: str, frame: int, columns: int, path: str | Path) -> list[float]:
-    where = f"{path}:{frame + 1}"
-    fields = line.split(",")
-    if len(fields) != columns:
-        raise InputError(f"{where}: found {len(fields)} fields where the header has {columns}")
-    try:
-        number, *motions = map(float, fields)
-    except ValueError as error:
-        raise InputError(f"{where}: not numbers: {error}") from error
-    if not np.isfinite(motions).all():
-        raise InputError(f"{where}: a motion must be finite, found nan or inf")
+    where, fields = f"{path}:{frame + 1}", line.split(",")
+    number, *motions = numbers(where, fields, columns, f"a line has {columns} finite numbers here")
     if number != frame:
         raise InputError(f"{where}: frame {fields[0]} where {frame} comes: frames count 1, 2, 3, ...")
     return motions

@@ -16,7 +16,6 @@ from multiprocessing import (
     set_start_method,
 )
 from multiprocessing.connection import Connection, wait
-from types import TracebackType
 from typing import Generic, TypeVar
 
 from rcnn_odom.errors import InputError
@@ -142,9 +141,7 @@ class Workers(Generic[Answer]):
     def __enter__(self) -> "Workers[Answer]":
         return self
 
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
+    def __exit__(self, *_: object) -> None:
         self.close()
 
 

@@ -74,15 +74,9 @@ class Way:
             if number >= WARM_UP:
                 self.times.append(1e3 * (time.perf_counter() - start))
 
-    @property
-    def median(self) -> float:
-        """Milliseconds."""
-        return float(np.median(self.times))
-
-    @property
-    def p99(self) -> float:
-        """Milliseconds."""
-        return float(np.percentile(self.times, 99))
+    def percentile(self, percent: float) -> float:
+        """Milliseconds within which so many of the times lie."""
+        return float(np.percentile(self.times, percent))
 
 
 class Nothing:
@@ -177,8 +171,8 @@ def stepping(odometer: Odometer, scans: list[Scan]) -> Compute:
 def report(ways: dict[str, Way], network: RCNNRegression) -> str:
     """A table of times, and the ratios with what is aimed at."""
     rows = [["ms a scan, one thread", "median", "99th percentile"]]
-    rows += [[name, f"{way.median:.2f}", f"{way.p99:.2f}"] for name, way in ways.items()]
-    time_of = {name: way.median for name, way in ways.items()}
+    rows += [[name, *(f"{way.percentile(each):.2f}" for each in (50, 99))] for name, way in ways.items()]
+    time_of = {name: way.percentile(50) for name, way in ways.items()}
     convolutions, eager_time = time_of["convolutions"], time_of["eager nn.LSTM"]
     fp32, int8 = (convolutions + time_of[f"read {kind} weights"] for kind in ("fp32", "int8"))
     ratios = [

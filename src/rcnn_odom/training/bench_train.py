@@ -27,7 +27,6 @@ from rcnn_odom.geometry import motions_of
 from rcnn_odom.models.cnn import CHANNELS, STRIDES
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.losses import regression_loss
-from rcnn_odom.training import defaults  # noqa: F401  the resolver of conf/model
 from rcnn_odom.training.settings import plain
 from rcnn_odom.training.stages import build_datamodule, build_module, build_trainer
 

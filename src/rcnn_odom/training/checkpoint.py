@@ -11,7 +11,7 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.two_numbers import steps_of
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training.modules import OdometryModule, module_for
-from rcnn_odom.training.saving import save_atomically
+from rcnn_odom.training.saving import AtomicCheckpointIO
 
 OLD_PLACES = {
     "network.": "model.",
@@ -118,5 +118,5 @@ def calibrate(path: Path, drives: list[Drive]) -> OdometryModule:
     module.model.calibrate(drives)
     saved = read_checkpoint(path)
     saved["state_dict"] = module.state_dict()
-    save_atomically(saved, path)
+    AtomicCheckpointIO().save_checkpoint(saved, path)
     return module

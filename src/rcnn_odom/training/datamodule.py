@@ -138,9 +138,8 @@ class OdometryDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Shuffled batches of windows: see :class:`rcnn_odom.training.windows.Windows`."""
         drives = self.drives["train"]
-        self.windows = windows = Windows(drives, self.sensor, self.window, self.max_turn_bins)
-        sampler = self._sampler()
-        rank, processes = self._place()
+        self.windows = Windows(drives, self.sensor, self.window, self.max_turn_bins)
+        sampler, (rank, processes) = self._sampler(), self._place()
         if self.fresh_epochs:
             self.close()
             self.worlds = FreshWorlds(
@@ -153,11 +152,11 @@ class OdometryDataModule(L.LightningDataModule):
                 keep=self.worlds_dir is None,
                 first=self.fresh_first,
             )
-            sampler = FreshSampler(windows, self.worlds, self.mirror, self.seed)
+            sampler = FreshSampler(self.windows, self.worlds, self.mirror, self.seed)
         # A batch is gathered in one call, so there is nothing to collate; worker processes would only
         # copy what a memory map gives for nothing.
         return TrainingLoader(
-            windows,
+            self.windows,
             batch_sampler=Batches(sampler, self._windows_in_batch(), rank, processes),  # type: ignore[arg-type]
             collate_fn=_as_is,
         )

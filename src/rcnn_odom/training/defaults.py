@@ -2,7 +2,7 @@
 
 from fnmatch import fnmatch
 
-from omegaconf import DictConfig, OmegaConf
+from omegaconf import DictConfig
 
 TABLE: tuple[tuple[str, str, str, str, float], ...] = (
     # option, model, data, data.scale: its default. The first row that fits counts.
@@ -35,6 +35,3 @@ def default(option: str, *, _parent_: DictConfig, _root_: DictConfig) -> float:
     data = _root_.get("data") or {}
     wanted = option, str(group["variant"]), str(data.get("name")), str(data.get("scale"))
     return next(value for *row, value in TABLE if all(map(fnmatch, wanted, row)))
-
-
-OmegaConf.register_new_resolver("default", default, replace=True)

@@ -66,8 +66,10 @@ def export_checkpoint(
     if known:
         print(f"\n{coverage_table(known)}\n", flush=True)
     _need_little_cost(reports, precision)
-    summary = _summary(reports[f"onnx {precision}"], data)
-    write_metadata(graphs[precision], steppers[precision].metadata | {"drift": summary})
+    report = reports[f"onnx {precision}"]
+    each = {name: one["drift"]["t_err"] for name, one in report["sequences"].items()}
+    drift = {"data": data["name"], "mean": report["drift"], "sequences": each}  # ratios
+    write_metadata(graphs[precision], steppers[precision].metadata | {"drift": drift})
     _write(graphs[precision], out, checkpoint)
 
 
@@ -148,9 +150,3 @@ def _need_little_cost(reports: dict[str, Report], precision: str) -> None:
             f"{precision} costs {100 * (mine - exact):.2f} percentage points of drift, more than "
             f"{100 * ALLOWED:g}, and is not written; {advice}"
         )
-
-
-def _summary(report: Report, data: Settings) -> Report:
-    """What the file tells of its drift, as ratios."""
-    by_sequence = {name: one["drift"]["t_err"] for name, one in report["sequences"].items()}
-    return {"data": data["name"], "mean": report["drift"], "sequences": by_sequence}

@@ -9,7 +9,7 @@ from threading import Event
 
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.cache import Encoded, Encoding, cache_path, encode_recordings
-from rcnn_odom.recordings.recording import Drive, OpenRecording
+from rcnn_odom.recordings.recording import Drive, OpenRecording, Recording
 from rcnn_odom.recordings.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
@@ -68,7 +68,7 @@ class FreshWorlds:
             InputError: a drive cannot be made.
         """
         wanted = [e for e in (epoch, epoch + 1) if 0 < e < self.epochs]
-        if wanted and self._workers is None and self.worker_count and not self._has_all(wanted):
+        if self.worker_count and not (self._workers or all(self._are_made(self._worlds(e)) for e in wanted)):
             log.info("new worlds for every epoch, made by %d processes beside training", self.worker_count)
             self._workers = Workers(self.worker_count, Encoding(self.open_recording, self.sensor), NICENESS)
         for gone in set(self._made) - set(wanted):
@@ -81,17 +81,15 @@ class FreshWorlds:
         self.waited = time.monotonic() - start
         return drives
 
-    def _names(self, epoch: int) -> list[str]:
-        return [f"{drive.name}~{self.first + epoch}" for drive in self.drives]
+    def _worlds(self, epoch: int) -> list[Recording]:
+        return [self.open_recording(f"{drive.name}~{self.first + epoch}") for drive in self.drives]
 
-    def _has_all(self, epochs: list[int]) -> bool:
-        worlds = (self.open_recording(name) for epoch in epochs for name in self._names(epoch))
+    def _are_made(self, worlds: list[Recording]) -> bool:
         return all(cache_path(world, self.sensor, self.folder).exists() for world in worlds)
 
     def _make(self, epoch: int) -> list[Drive]:
-        worlds = [self.open_recording(name) for name in self._names(epoch)]
-        paths = [cache_path(world, self.sensor, self.folder) for world in worlds]
-        while not (self.worker_count or all(path.exists() for path in paths)):
+        worlds = self._worlds(epoch)
+        while not (self.worker_count or self._are_made(worlds)):
             if self._closed.wait(POLLING):
                 return []
         return encode_recordings(worlds, self.sensor, self.folder, max(1, self.worker_count), self._workers)

@@ -18,7 +18,6 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import ERROR
-from rcnn_odom.training import defaults  # noqa: F401  the resolver of conf/model
 from rcnn_odom.training.run_state import find_stopped
 from rcnn_odom.training.settings import RENAMED, plain
 from rcnn_odom.training.sweep import folder_name
@@ -71,7 +70,8 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
     try:
         if in_sweep():
-            _check_sweep()
+            if any(override.split("=")[0] == "run_dir" for override in HydraConfig.get().overrides.task):
+                raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
             (folder / ERROR).unlink(missing_ok=True)
         elif "sweeps" in HydraConfig.get().runtime.choices:
             raise InputError("+sweeps= needs -m: one run would take nothing from a sweep")
@@ -79,30 +79,18 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
         return job(cfg)
     except SystemExit:  # how Lightning ends after Ctrl-C
         raise KeyboardInterrupt from None
-    except (InputError, OSError) as error:
-        is_full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-        full = "; make room, and the same command goes on" if is_full else ""
-        log.error("error: %s%s", error, full)
-        _failed.append(error)
+    except Exception as error:
+        is_users = isinstance(error, InputError | OSError)
+        if is_users:
+            is_full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
+            log.error("error: %s%s", error, "; make room, and the same command goes on" if is_full else "")
+            _failed.append(error)
         if in_sweep():
-            _leave_error(folder, error)
+            with suppress(OSError):  # the error itself may be that nothing can be written
+                (folder / ERROR).write_text(" ".join(f"{type(error).__name__}: {error}".split()) + "\n")
+        if in_sweep() or not is_users:
             raise
         return None
-    except Exception as error:
-        if in_sweep():
-            _leave_error(folder, error)
-        raise
-
-
-def _check_sweep() -> None:
-    hydra = HydraConfig.get()
-    if any(override.split("=")[0] == "run_dir" for override in hydra.overrides.task):
-        raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
-
-
-def _leave_error(folder: Path, error: Exception) -> None:
-    with suppress(OSError):  # the error itself may be that nothing can be written
-        (folder / ERROR).write_text(" ".join(f"{type(error).__name__}: {error}".split()) + "\n")
 
 
 def run_command(main: Callable[[], object]) -> int:

@@ -1,7 +1,6 @@
 """Hardware-dependent settings with automatic fallbacks."""
 
 import ctypes
-import sys
 
 import torch
 
@@ -14,14 +13,12 @@ def keep_freed_memory() -> None:
 
     Every step would otherwise have the kernel clear the same hundreds of megabytes again.
     """
-    if sys.platform.startswith("linux"):
-        mallopt = getattr(ctypes.CDLL(None), "mallopt", None)
-        if mallopt is not None:
-            # Older versions take no more than half a heap of a thread.
-            if not mallopt(M_MMAP_THRESHOLD, 1 << 30):
-                mallopt(M_MMAP_THRESHOLD, 1 << 25)
-            mallopt(M_TRIM_THRESHOLD, 1 << 30)
-            mallopt(M_TOP_PAD, 1 << 26)
+    if mallopt := getattr(ctypes.CDLL(None), "mallopt", None):
+        # Older versions take no more than half a heap of a thread.
+        if not mallopt(M_MMAP_THRESHOLD, 1 << 30):
+            mallopt(M_MMAP_THRESHOLD, 1 << 25)
+        mallopt(M_TRIM_THRESHOLD, 1 << 30)
+        mallopt(M_TOP_PAD, 1 << 26)
 
 
 def resolve_precision(precision: str, accelerator: str) -> str:

@@ -134,8 +134,10 @@ class OdometryModule(L.LightningModule):
         return self.trainer.datamodule  # type: ignore[attr-defined,no-any-return]
 
     def on_validation_epoch_start(self) -> None:
-        """Forgets the estimates of the epoch before."""
+        """Forgets the estimates of the epoch or the test before."""
         self.estimates = {}
+
+    on_test_epoch_start = on_validation_epoch_start
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Keeps the estimate of one whole drive.
@@ -168,10 +170,6 @@ class OdometryModule(L.LightningModule):
                 each = [metric.compute(drive, self.estimates[drive.name], self.lengths) for drive in drives]
                 values[metric.name] = metric.over(each, frames)
         self.log_dict({f"val/{name}": value for name, value in values.items() if value is not None})
-
-    def on_test_epoch_start(self) -> None:
-        """Forgets the estimates of an earlier test."""
-        self.estimates = {}
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
         """Keeps the estimate of one whole drive; ``rcnn_odom.evaluation.scores`` scores it."""

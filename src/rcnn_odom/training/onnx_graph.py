@@ -144,7 +144,6 @@ def _stream(stepper: Stepper, pairs: list[Any]) -> FloatArray:
     """Steps (N, 3, 4) from the beginning on: x, y and heading in the first column, covariances beside it."""
     stepper.reset()
     steps = [stepper(pair) for pair in pairs]
-    stepper.reset()
     return np.array([np.column_stack([step.array(), step.covariance]) for step in steps])
 
 
@@ -267,22 +266,9 @@ def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
 
 
 def _metadata(model: TrainedModel) -> dict[str, Any]:
-    told = asdict(model.describe())
-    typical = [_or_null(value) for value in told.pop("typical_step")]
-    sensor = told.pop("sensor")
-    return {
-        "version": __version__,
-        "variant": model.name,
-        "format": FORMAT,
-        "sensor": sensor,
-        "typical_step": typical,
-        **{key: _or_null(value) for key, value in told.items()},
-    }
-
-
-def _or_null(value: float) -> float | None:
-    """JSON has no nan."""
-    return None if np.isnan(value) else value
+    # JSON has no nan: null stands for it.
+    told = json.loads(json.dumps(asdict(model.describe())), parse_constant=lambda _: None)
+    return {"version": __version__, "variant": model.name, "format": FORMAT, **told}
 
 
 @contextmanager

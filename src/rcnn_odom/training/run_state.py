@@ -30,11 +30,15 @@ DECIDING = (
     "geometry.py",
     *("models/*.py", "recordings/*.py", "simulation/**/*.py"),
     *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/fresh_worlds.py"),
+    *("training/stages.py", "training/checkpoint.py", "training/saving.py", "training/machine.py"),
     *("evaluation/drift.py", "evaluation/drift_metric.py"),
 )
 """Sources that decide what a training gives."""
 
-LINKED = (CONFIG, METRICS, "train.log", "checkpoints", "trajectories", "figures")
+LINKED = (
+    *(CONFIG, METRICS, "train.log", "checkpoints", "trajectories", "figures"),
+    *("model.onnx", "model_int8.onnx"),
+)
 """What of a run is also seen in ``outputs/latest``: not its curves, which TensorBoard would show twice."""
 
 
@@ -169,6 +173,9 @@ def entered(run: Path, settings: Settings) -> Iterator[None]:
         run.mkdir(parents=True, exist_ok=True)
         if not _claim(run):
             raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
+        if (run / METRICS).exists():  # finished by another process since the first look
+            _release(run)
+            raise InputError(f"{run}: holds a finished run; choose another run_dir")
         write_config(run, settings)
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error

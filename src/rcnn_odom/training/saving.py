@@ -31,30 +31,26 @@ class Stopped(Exception):
     """Training was asked to stop, and has saved what it needs to go on."""
 
 
-def save_atomically(content: dict[str, Any], path: Path) -> None:
-    """Writes numbers for ``torch.load(path, weights_only=True)``, at once or not at all.
-
-    Raises:
-        InputError: it cannot be written; what was there before still is.
-    """
-    try:
-        write_atomically(path, partial(torch.save, content))
-    except (OSError, RuntimeError) as error:  # torch's writer turns an OSError into the latter
-        cause = error.__context__ if isinstance(error.__context__, OSError) else error
-        reason = cause.strerror if isinstance(cause, OSError) else str(error).splitlines()[0]
-        kept = "the one before is kept; " if path.exists() else ""
-        raise InputError(
-            f"{path}: checkpoint cannot be written ({reason}); {kept}make room there, and the same command "
-            "goes on"
-        ) from error
-
-
 class AtomicCheckpointIO(TorchCheckpointIO):
-    """Lightning's checkpoints by :func:`save_atomically`; its own may end half-written on another disk."""
+    """Checkpoints of numbers, written at once or not at all; Lightning's may end half-written on a disk."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Called by the Trainer on the process that writes."""
-        save_atomically(checkpoint, Path(path))
+        """Called by the Trainer on the process that writes.
+
+        Raises:
+            InputError: it cannot be written; what was there before still is.
+        """
+        path = Path(path)
+        try:
+            write_atomically(path, partial(torch.save, checkpoint))
+        except (OSError, RuntimeError) as error:  # torch's writer turns an OSError into the latter
+            cause = error.__context__ if isinstance(error.__context__, OSError) else error
+            reason = cause.strerror if isinstance(cause, OSError) else str(error).splitlines()[0]
+            kept = "the one before is kept; " if path.exists() else ""
+            raise InputError(
+                f"{path}: checkpoint cannot be written ({reason}); {kept}make room there, and the same "
+                "command goes on"
+            ) from error
 
 
 class Best(ModelCheckpoint):
@@ -161,13 +157,9 @@ class Saving(Callback):
         trainer.save_checkpoint(self.path)
         self._last_saved = time.monotonic()
 
-    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Gives the signals back."""
+    def on_train_end(self, trainer: L.Trainer, pl_module: L.LightningModule, *_: BaseException) -> None:
+        """Gives the signals back, also when training fails."""
         while self._handlers:
             signal.signal(*self._handlers.popitem())
 
-    def on_exception(
-        self, trainer: L.Trainer, pl_module: L.LightningModule, exception: BaseException
-    ) -> None:
-        """Gives the signals back."""
-        self.on_train_end(trainer, pl_module)
+    on_exception = on_train_end  # type: ignore[assignment]

@@ -8,7 +8,7 @@ from omegaconf import DictConfig
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.metrics import Report
-from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, Settings, read_settings
+from rcnn_odom.evaluation.run_folder import BEST, METRICS, Settings, home_of, read_settings
 from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.models.constant import mean_step
 from rcnn_odom.models.contract import find_model
@@ -55,8 +55,7 @@ def _score_run(chosen: Settings) -> tuple[Settings, Report]:
     module = load_module(run / BEST, sensor=Sensor(**settings["data"]["sensor"]))
     datamodule = build_datamodule(settings).load(("test",))
     scores = score_module(module, datamodule, trainer, settings["data"], folder)
-    home = (run / CONFIG).resolve().parent  # `latest` is a folder of links
-    of = {"run": os.path.relpath(home), "variant": module.variant, "data": settings["data"]["name"]}
+    of = {"run": os.path.relpath(home_of(run)), "variant": module.variant, "data": settings["data"]["name"]}
     return settings, {**of, **scores}
 
 

@@ -8,7 +8,13 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import Settings, flat
+from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.options import check_options, option
+from rcnn_odom.recordings.formats import find_format
+from rcnn_odom.training.defaults import default
+
+# For conf/model.
+OmegaConf.register_new_resolver("default", default, replace=True)
 
 PATHS = ("root", "reference", "pretrained", "run", "run_dir", "outputs")
 """Options that may look like a number on the command line, ``data.root=2011``, and are a path."""
@@ -34,15 +40,6 @@ def _are_lengths(lengths: list[Any]) -> bool:
 
 
 @dataclass(kw_only=True)
-class SensorOptions:
-    """``data.sensor``."""
-
-    max_range: float = option(above=0)
-    field_of_view_deg: float = option(above=0)
-    resolution_deg: float = option(above=0)
-
-
-@dataclass(kw_only=True)
 class AugmentOptions:
     """``data.augment``."""
 
@@ -54,7 +51,7 @@ class AugmentOptions:
 class DataOptions:
     """What the files of ``conf/data`` have in common."""
 
-    sensor: SensorOptions
+    sensor: Sensor
     augment: AugmentOptions
     train: list[Any] = _names()  # noqa: RUF009
     val: list[Any] = _names()  # noqa: RUF009
@@ -64,36 +61,6 @@ class DataOptions:
     )
     apply: str = option(choices=("start", "middle", "end"))
     workers: int | None = option(above=0)
-
-
-@dataclass(kw_only=True)
-class KittiOptions(DataOptions):
-    """``conf/data/kitti.yaml``."""
-
-    ring: int | None = option(least=0, wanted="null or a whole number, not negative")
-
-
-@dataclass(kw_only=True)
-class RealismOptions:
-    """``data.realism``."""
-
-    tilt: bool
-    movers: bool
-    missing: bool
-
-
-@dataclass(kw_only=True)
-class SimulatedOptions(DataOptions):
-    """``conf/data/simulated.yaml`` and ``indoor.yaml``."""
-
-    realism: RealismOptions
-    fresh_worlds: bool
-    keep_worlds: bool
-    vary_pace: bool
-    world: str = option(choices=("street", "indoor"))
-    scale: str = option(choices=("small", "full"))
-    frames: int | None = option(above=0)
-    world_seed: int = option(least=0, below=2**32, wanted="a whole number, not negative")
 
 
 @dataclass(kw_only=True)
@@ -107,13 +74,10 @@ class TrainerOptions:
 
 @dataclass(kw_only=True)
 class Options:
-    """What stands in no group."""
+    """What every run has, whatever its data and its model."""
 
+    trainer: TrainerOptions
     seed: int = option(least=0, below=2**32, wanted="a whole number, not negative")
-
-
-FORMATS = {"kitti": KittiOptions, "simulated": SimulatedOptions}
-"""Options of recordings by their format."""
 
 
 def plain(cfg: DictConfig) -> Settings:
@@ -130,7 +94,7 @@ def plain(cfg: DictConfig) -> Settings:
         if (group := ".".join(name.split(".")[:2])) in RENAMED:
             raise InputError(f"{group} has become {RENAMED[group]}; set that")
     # Before others are looked up by it, where Hydra would name those and not the mistake.
-    _check(_without_references(given), complete=False)
+    _check(given, complete=False)
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
@@ -144,24 +108,18 @@ def plain(cfg: DictConfig) -> Settings:
     return settings
 
 
-def _without_references(values: Settings) -> Settings:
-    kept = {
-        name: value for name, value in values.items() if isinstance(value, dict) or "${" not in str(value)
-    }
-    return {name: _without_references(v) if isinstance(v, dict) else v for name, v in kept.items()}
-
-
 def _check(settings: Settings, complete: bool) -> None:
     """Compares the settings with their options; a model's have to be all there when they are complete."""
     data, model = settings.get("data") or {}, dict(settings.get("model") or {})
     check_options(Options, settings, "", partly=True)
-    reader = data.get("reader") or {}
-    check_options(FORMATS.get(reader.get("format", ""), DataOptions), data, "data.", partly=True)
-    check_options(TrainerOptions, settings.get("trainer") or {}, "trainer.", partly=True)
+    check_options(DataOptions, data, "data.", partly=True)
+    if name := (data.get("reader") or {}).get("format"):
+        check_options(getattr(find_format(name), "Options", DataOptions), data, "data.", partly=True)
     if variant := model.pop("variant", None):
         from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
 
         check_options(find_model(variant).Options, model, "model.", partly=not complete)
+        settings["model"] |= model  # with the defaults of what was left out
 
 
 def _name_paths(settings: Settings) -> None:

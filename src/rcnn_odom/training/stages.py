@@ -4,10 +4,8 @@ import logging
 import pickle
 import shutil
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING
 
 import lightning as L
 from lightning.pytorch.loggers import TensorBoardLogger
@@ -17,10 +15,9 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import fitting_lengths
 from rcnn_odom.evaluation.metrics import Report
-from rcnn_odom.evaluation.run_folder import BEST, LAST, METRICS, Settings, read_metrics_file
+from rcnn_odom.evaluation.run_folder import BEST, LAST, METRICS, Settings, home_of, read_metrics_file
 from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.files import one_at_a_time
-from rcnn_odom.geometry import Steps
 from rcnn_odom.models.contract import find_model
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.formats import open_recording
@@ -43,9 +40,6 @@ from rcnn_odom.training.run_state import (
 from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped
 from rcnn_odom.training.tensorboard import Layout, log_run
 from rcnn_odom.training.training_log import TrainingLog
-
-if TYPE_CHECKING:
-    from matplotlib.figure import Figure
 
 log = logging.getLogger(__name__)
 
@@ -143,7 +137,8 @@ def train(settings: Settings, *, reuse: bool = False) -> Report:
         InputError: see its message.
         KeyboardInterrupt: stopped from the keyboard or by a signal; the log says how to go on.
     """
-    variant, run, outputs = settings["model"]["variant"], Path(settings["run_dir"]), Path(settings["outputs"])
+    run, outputs = home_of(Path(settings["run_dir"])), Path(settings["outputs"])
+    settings, variant = settings | {"run_dir": str(run)}, settings["model"]["variant"]
     if not find_model(variant).trains:
         raise InputError(
             f"model={variant} has nothing to train; score it: python evaluate.py model={variant} data=..."
@@ -197,7 +192,9 @@ def train_module(
         metrics |= _take_weights(found.run, run)
     else:
         metrics |= _fit(settings, datamodule, trainer, wanted)
-    metrics |= _finish_run(settings, datamodule, trainer, run)
+    module = calibrate(run / BEST, datamodule.drives["val"])
+    metrics |= {"variant": module.variant, "data": settings["data"]["name"]}
+    metrics |= score_module(module, datamodule, trainer, settings["data"], run)
     assert isinstance(trainer.logger, TensorBoardLogger)
     log_run(trainer.logger, settings, metrics, settings["model"]["epochs"] * datamodule.batches_per_epoch)
     write_json(run / METRICS, metrics)
@@ -271,7 +268,8 @@ def _begin_with_first_stage(
 def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, variant: str) -> Path:
     """Checkpoint of the first stage: given, found among the runs, or trained now.
 
-    One that is found has the same recordings, network, recipe and seed, and was trained by the same code.
+    One that is found has the same recordings, network, recipe and seed, and was trained by the same code;
+    only the own one of a run that was stopped is kept whatever the code, and the log says so.
     """
     model = settings["model"]
     if model.get("pretrained"):
@@ -288,19 +286,9 @@ def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, varian
             log.info("first stage: no fitting %s in %s, training one", variant, outputs)
             with entered(run, settings):
                 train_module(settings, stage_data, build_trainer(settings, run), wanted)
+        elif read_metrics_file(found.run).get("code") != wanted.code:
+            log.info("the code has changed since the first stage of this run was trained; it is kept")
     return found.run / BEST
-
-
-def _finish_run(settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, run: Path) -> Report:
-    """Scores the checkpoint with the best validation drift on the test drives.
-
-    Before that its uncertainty is fitted on the validation drives.
-    """
-    module = calibrate(run / BEST, datamodule.drives["val"])
-    assert isinstance(trainer.logger, TensorBoardLogger)
-    add_figure = trainer.logger.experiment.add_figure
-    scores = score_module(module, datamodule, trainer, settings["data"], run, add_figure)
-    return {"variant": module.variant, "data": settings["data"]["name"]} | scores
 
 
 def score_module(
@@ -309,30 +297,24 @@ def score_module(
     trainer: L.Trainer,
     data: Settings,
     folder: Path,
-    add_figure: "Callable[[str, Figure], None] | None" = None,
 ) -> Report:
-    """Estimates the test drives with a network and scores it.
+    """Estimates the test drives with a network and scores it; a trainer's TensorBoard gets the figures.
 
     Args:
         module: with the network.
         datamodule: with the test drives.
         trainer: tests, perhaps in other processes.
-        data, folder, add_figure: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
+        data, folder: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
     """
-    steps = _estimate_test(module, datamodule, trainer)
-    mean_step, stepper = module.mean_step.double().numpy(), module.model.stepper()
-    drives = datamodule.drives["test"]
-    return report_drives(module.variant, steps, mean_step, stepper, drives, data, folder, add_figure)
-
-
-def _estimate_test(
-    module: OdometryModule, datamodule: OdometryDataModule, trainer: L.Trainer
-) -> dict[str, Steps]:
-    """The steps of the test drives by their names."""
-    with TemporaryDirectory() as folder, one_line_errors(trainer):
+    with TemporaryDirectory() as shared, one_line_errors(trainer):
         # Other processes cannot hand their estimates over in memory.
-        module.estimates_file = Path(folder) / "estimates" if trainer.world_size > 1 else None
+        module.estimates_file = Path(shared) / "estimates" if trainer.world_size > 1 else None
         trainer.test(module, datamodule=datamodule, verbose=False)
         if module.estimates_file:
             module.estimates = pickle.loads(module.estimates_file.read_bytes())
-    return module.estimates
+    mean_step, stepper = module.mean_step.double().numpy(), module.model.stepper()
+    drives, logger = datamodule.drives["test"], trainer.logger
+    add_figure = logger.experiment.add_figure if isinstance(logger, TensorBoardLogger) else None
+    return report_drives(
+        module.variant, module.estimates, mean_step, stepper, drives, data, folder, add_figure
+    )

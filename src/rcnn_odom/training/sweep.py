@@ -45,7 +45,7 @@ def expected_folders(sweep: Path) -> list[str] | None:
 
     try:
         settings = OmegaConf.load(sweep / "multirun.yaml").hydra
-        if draws_its_jobs(settings.sweeper._target_):
+        if not settings.sweeper._target_.endswith(".BasicSweeper"):  # others draw values
             return None
         swept = [f"{key}={value}" for key, value in (settings.sweeper.params or {}).items()]
         overrides = OverridesParser.create().parse_overrides([*swept, *settings.overrides.task])
@@ -59,8 +59,3 @@ def expected_folders(sweep: Path) -> list[str] | None:
         pairs = [pair for pair in job if pair.split("=")[0].lstrip("+~") not in excluded]
         names.append(folder_name(SEPARATOR.join(pairs).replace("=", equals)))
     return names
-
-
-def draws_its_jobs(sweeper: str) -> bool:
-    """Whether a sweeper, a class' full name, draws values, unlike Hydra's own, which goes through a grid."""
-    return not sweeper.endswith(".BasicSweeper")

@@ -7,7 +7,7 @@ from statistics import fmean
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.scores import percent
 from rcnn_odom.evaluation.sweep_report.document import DASH, Row, escape, markdown_table, number
-from rcnn_odom.evaluation.sweep_report.options import Values, parse_choice, show_value
+from rcnn_odom.evaluation.sweep_report.options import Values, matches, parse_choice
 from rcnn_odom.evaluation.sweep_report.paper import NETWORK
 from rcnn_odom.evaluation.sweep_report.runs_table import Sweep
 from rcnn_odom.evaluation.sweep_report.statistics import (
@@ -80,7 +80,7 @@ def _chosen(sweep: Sweep, wanted: Sequence[str]) -> Values:
     found = []
     for setting in sweep.by_setting:
         values = dict(zip(sweep.options, setting, strict=True))
-        if all(show_value(values.get(short.get(key, key))) == value for key, value in pairs):
+        if all(matches(values, short.get(key, key), value) for key, value in pairs):
             found.append(setting)
     if len(found) != 1:
         several = "several settings have it" if found else "no setting has it"

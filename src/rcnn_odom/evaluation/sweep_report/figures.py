@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.figures import draw_trajectory
+from rcnn_odom.evaluation.figures import draw_trajectory, new_figure
 from rcnn_odom.evaluation.scores import percent
 from rcnn_odom.evaluation.sweep_report.document import MARK, code, escape, image
 from rcnn_odom.evaluation.sweep_report.folders import Run
@@ -32,10 +32,10 @@ LEAST_SEGMENTS = 3
 def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
     """Drift against the length of a segment; adds the figure. Empty where no run has enough segments."""
     curves = {
-        sweep.label(setting): [curve for run in runs.values() if len(curve := length_curve(run))]
+        sweep.label(setting): found
         for setting, runs in sweep.by_setting.items()
+        if (found := [curve for run in runs.values() if len(curve := length_curve(run))])
     }
-    curves = {label: runs for label, runs in curves.items() if runs}
     if not curves:
         return ""
     figures["length"] = png(curves_figure(curves))
@@ -85,14 +85,10 @@ def trajectories_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
 
 
 def middle_run(runs: Sequence[Run]) -> Run:
-    """The run of median validation drift, of two in the middle the better; runs without one come last."""
-
-    def order(run: Run) -> float:
-        drift = run.metrics.scores["val_drift"]
-        return np.inf if drift is None else drift
-
-    known = [run for run in runs if np.isfinite(order(run))]
-    return sorted(known or runs, key=order)[(len(known or runs) - 1) // 2]
+    """The run of median validation drift, of two in the middle the better; without any just one of them."""
+    drifts = {run: run.metrics.scores["val_drift"] for run in runs}
+    known = sorted((run for run in runs if drifts[run] is not None), key=drifts.__getitem__) or runs
+    return known[(len(known) - 1) // 2]
 
 
 def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
@@ -101,14 +97,10 @@ def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
     Raises:
         InputError: a file is not there or not a trajectory.
     """
-    folder, name = run.folder / "trajectories", file_name(sequence)
-    truth, estimate = (flatten(read_kitti(folder / file)) for file in (f"{name}_truth.txt", f"{name}.txt"))
-    return _from_start(truth), _from_start(estimate)
-
-
-def _from_start(camera_poses: FloatArray) -> FloatArray:
-    places: FloatArray = (np.linalg.inv(camera_poses[0]) @ camera_poses)[:, [0, 2], 3]
-    return places
+    names = (f"{file_name(sequence)}_truth.txt", f"{file_name(sequence)}.txt")
+    truth, estimate = (flatten(read_kitti(run.folder / "trajectories" / name)) for name in names)
+    truth, estimate = (np.linalg.inv(poses[0]) @ poses for poses in (truth, estimate))
+    return truth[:, [0, 2], 3], estimate[:, [0, 2], 3]
 
 
 def png(figure: "Figure") -> bytes:
@@ -124,10 +116,7 @@ def drift_figure(drifts: Mapping[str, Mapping[int, float]]) -> "Figure":
     Args:
         drifts: ratio by seed, by the label of the setting; settings without a run show nothing.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(8, 1.4 + 0.45 * len(drifts)), layout="constrained")
-    axes = figure.subplots()
+    figure, axes = new_figure(8, 1.4 + 0.45 * len(drifts))
     seeds = sorted({seed for runs in drifts.values() for seed in runs})
     for place, runs in enumerate(drifts.values()):
         if runs:
@@ -151,10 +140,7 @@ def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
     Args:
         curves: of the seeds, each of :func:`length_curve`, by the label of the setting.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.4 + 0.18 * max(0, len(curves) - 3)), layout="constrained")
-    panels = list(figure.subplots(1, 2))
+    figure, panels = new_figure(11, 4.4 + 0.18 * max(0, len(curves) - 3), ncols=2)
     for index, (label, runs) in enumerate(curves.items()):
         rows = np.concatenate(runs)
         lengths = np.unique(rows[:, 0])
@@ -182,12 +168,9 @@ def trajectories_figure(title: str, panels: Mapping[str, tuple[FloatArray, Float
         title: above all of them.
         panels: true and estimated places, see :func:`trajectory`, by the panel's title.
     """
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(max(4.6 * len(panels), 7), 4.6), layout="constrained")
+    figure, axes = new_figure(max(4.6 * len(panels), 7), 4.6, ncols=len(panels), squeeze=False)
     figure.suptitle(_plain(title), fontweight="bold")
-    axes = figure.subplots(1, len(panels), squeeze=False)[0]
-    for one, (name, pair) in zip(axes, panels.items(), strict=True):
+    for one, (name, pair) in zip(axes[0], panels.items(), strict=True):
         draw_trajectory(one, _plain(name), *pair)
     return figure
 

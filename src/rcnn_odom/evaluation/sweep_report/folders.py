@@ -65,7 +65,8 @@ class Run:
         name: its path below the folder that was searched.
         status: ``finished``, ``unfinished``, ``failed`` or ``damaged``.
         problem: why it is not finished, one line; empty for a finished run.
-        settings: its resolved configuration under dotted names; empty where that cannot be read.
+        settings: its resolved configuration under dotted names, lists as tuples; empty where that cannot be
+            read.
         overrides: what its command set.
         metrics: what its ``metrics.json`` holds; empty unless finished.
     """
@@ -133,9 +134,11 @@ def read_run(folder: Path, name: str) -> Run:
     finished = (folder / METRICS).exists()
     if (folder / CONFIG).exists():
         try:
-            run = replace(run, settings=flat(read_settings(folder, ("data", "model"))))
+            settings = flat(read_settings(folder, ("data", "model")))
         except InputError:
             return replace(run, status="damaged", problem=f"{CONFIG} cannot be read")
+        tuples = {name: tuple(value) for name, value in settings.items() if isinstance(value, list)}
+        run = replace(run, settings=settings | tuples)
     if finished:
         run = _read_finished(run)
     if run.settings and "seed" not in run.settings and not run.is_evaluation:
@@ -186,11 +189,11 @@ def _of_length(test: Report, length: str) -> tuple[int, float, float]:
     drifts = [one["drift"].get("per_length", {}).get(length) for one in test["sequences"].values()]
     parts = [part for part in drifts if part]
     segments = sum(part["segments"] for part in parts)
-    means = [
+    t_err, r_err = (
         sum(part["segments"] * part[key] for part in parts) / max(segments, 1)
         for key in ("t_err", "r_err_deg_per_m")
-    ]
-    return segments, means[0], means[1]
+    )
+    return segments, t_err, r_err
 
 
 def _method_scores(report: Report) -> Scores:

@@ -1,7 +1,7 @@
 """Which options differ between runs, and whether the runs can be compared at all."""
 
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import yaml
@@ -29,15 +29,18 @@ Values = tuple[Any, ...]
 """A setting: the values of the swept options in their order, lists as tuples."""
 
 
-def value_of(run: Run, option: str) -> Any:
-    """What a run's configuration says of an option, None where it does not know it; lists as tuples."""
-    value = run.settings.get(option)
-    return tuple(value) if isinstance(value, list) else value
-
-
 def setting_of(run: Run, options: Sequence[str]) -> Values:
-    """The values of several options."""
-    return tuple(value_of(run, option) for option in options)
+    """What a run's configuration says of several options, None where it does not know one."""
+    return tuple(map(run.settings.get, options))
+
+
+def _differing(runs: Sequence[Run]) -> list[str]:
+    """Options that make a setting of their own and are not the same in all of the runs."""
+    return [
+        name
+        for name in dict.fromkeys(name for run in runs for name in run.settings)
+        if not NO_SETTING_OF_THEIR_OWN.fullmatch(name) and len({run.settings.get(name) for run in runs}) > 1
+    ]
 
 
 def swept_options(runs: Sequence[Run]) -> list[str]:
@@ -47,11 +50,8 @@ def swept_options(runs: Sequence[Run]) -> list[str]:
     because a default has changed between them: means are taken over equal runs only.
     """
     named = dict.fromkeys(_option(override) for run in runs for override in run.overrides)
-    options = [
-        option
-        for option in named
-        if not NO_SETTING_OF_THEIR_OWN.fullmatch(option) and len({value_of(run, option) for run in runs}) > 1
-    ]
+    differing = _differing(runs)
+    options = [option for option in named if option in differing]
     while (other := _unexplained(runs, options)) is not None:
         options.append(other)
     return options
@@ -69,13 +69,10 @@ def _unexplained(runs: Sequence[Run], options: Sequence[str]) -> str | None:
     for run in runs:
         groups.setdefault(setting_of(run, options), []).append(run)
     for group in groups.values():
-        names = dict.fromkeys(name for run in group for name in run.settings)
-        for name in sorted(names, key=lambda name: not name.startswith("model.")):
-            # Data that differ unasked are no setting of their own, see check_same_data.
-            if name.startswith("data.") or NO_SETTING_OF_THEIR_OWN.fullmatch(name):
-                continue
-            if len({value_of(run, name) for run in group}) > 1:
-                return name
+        # Data that differ unasked are no setting of their own, see check_same_data.
+        names = [name for name in _differing(group) if not name.startswith("data.")]
+        if names:
+            return min(names, key=lambda name: not name.startswith("model."))
     return None
 
 
@@ -91,18 +88,14 @@ def check_same_data(runs: Sequence[Run], options: Iterable[str]) -> None:
     """
     allowed = set(options) - set(SAME_DRIVES)
     for run in runs[1:]:
-        for name in sorted({*runs[0].settings, *run.settings}):
-            if not name.startswith("data.") or NO_SETTING_OF_THEIR_OWN.fullmatch(name) or name in allowed:
-                continue
-            pair = value_of(runs[0], name), value_of(run, name)
-            if pair[0] != pair[1]:
-                first, second = map(show_value, pair)
+        for name in sorted(_differing([runs[0], run])):
+            if name.startswith("data.") and name not in allowed:
+                first, second = (show_value(one.settings.get(name)) for one in (runs[0], run))
                 raise InputError(
                     f"{runs[0].name} and {run.name} differ in {name}, {first} and {second}: "
-                    f"{NOT_IN_ONE_TABLE}; choose with --only {name}={second if pair[0] is None else first}, "
+                    f"{NOT_IN_ONE_TABLE}; choose with --only {name}={second if first == '-' else first}, "
                     "or name a folder of fewer runs"
                 )
-    for run in runs[1:]:
         first, second = (", ".join(one.metrics.sequences) for one in (runs[0], run))
         if first != second:
             raise InputError(
@@ -130,9 +123,9 @@ def choose(runs: Sequence[Run], only: Iterable[str]) -> list[Run]:
     kept = list(runs)
     for text in only:
         key, value = parse_choice(text)
-        fitting = [run for run in kept if run.settings and matches(run, key, value)]
+        fitting = [run for run in kept if matches(run.settings, key, value)]
         if not fitting:
-            known = sorted({show_value(value_of(run, key)) for run in kept if key in run.settings})
+            known = sorted({show_value(run.settings[key]) for run in kept if key in run.settings})
             have = f"they have {', '.join(known)}" if known else "give an option's full name, data.scale=full"
             raise InputError(f"--only {text}: no run has it; {have}")
         kept = [run for run in kept if run in fitting or not run.settings]
@@ -151,10 +144,9 @@ def parse_choice(text: str) -> tuple[str, str]:
     return GROUPS.get(key, key), value
 
 
-def matches(run: Run, key: str, value: str) -> bool:
-    """Whether a run's option has the value that a person wrote."""
-    own = value_of(run, key)
-    return key in run.settings and (show_value(own) == value or own == _as_value(value))
+def matches(values: Mapping[str, Any], key: str, value: str) -> bool:
+    """Whether an option (one of the values by their names) has the value that a person wrote."""
+    return key in values and (show_value(values[key]) == value or values[key] == _as_value(value))
 
 
 def _as_value(text: str) -> Any:

@@ -1,9 +1,7 @@
 """What the paper says, word for number: Valente, Joly and de La Fortelle, *An LSTM Network for Real-Time
 Odometry Estimation*, 2019."""
 
-from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
 
 
 @dataclass(frozen=True)
@@ -12,43 +10,34 @@ class PaperColumn:
 
     Attributes:
         name: its heading.
-        drift: of a test sequence, and ``mean``, as ratios.
+        drift: of the test sequences, and their mean, as ratios.
         seconds: a frame, without a GPU.
     """
 
     name: str
-    drift: dict[str, float]
+    drift: tuple[float, float, float]
     seconds: float
-
-
-def _column(name: str, first: float, second: float, mean: float, seconds: float) -> PaperColumn:
-    return PaperColumn(name, {"05": first, "07": second, "mean": mean}, seconds)
 
 
 SEQUENCES = ("05", "07")
 """The paper's test sequences, of KITTI's odometry benchmark."""
 
 VARIANTS = {
-    "cnn_reg": _column("CNN-Regression", 0.2888, 0.1281, 0.2084, 0.005),
-    "cnn_cls": _column("CNN-Classification", 0.2764, 0.0756, 0.1760, 0.005),
-    "rcnn_reg": _column("RCNN-Regression", 0.0293, 0.0218, 0.0255, 0.015),
-    "rcnn_cls": _column("RCNN-Classification", 0.2488, 0.1251, 0.1869, 0.015),
+    "cnn_reg": PaperColumn("CNN-Regression", (0.2888, 0.1281, 0.2084), 0.005),
+    "cnn_cls": PaperColumn("CNN-Classification", (0.2764, 0.0756, 0.1760), 0.005),
+    "rcnn_reg": PaperColumn("RCNN-Regression", (0.0293, 0.0218, 0.0255), 0.015),
+    "rcnn_cls": PaperColumn("RCNN-Classification", (0.2488, 0.1251, 0.1869), 0.015),
 }
 """Table II, its own networks by the name of the variant here."""
 
 COMPARED_METHODS = (
-    _column("DeepVO (one camera)", 0.0262, 0.0391, 0.0326, 1.0),
-    _column("3D LiDAR CNN (Velas et al.)", 0.0235, 0.0177, 0.0206, 0.7),
+    PaperColumn("DeepVO (one camera)", (0.0262, 0.0391, 0.0326), 1.0),
+    PaperColumn("3D LiDAR CNN (Velas et al.)", (0.0235, 0.0177, 0.0206), 0.7),
 )
 """Table II, the methods that it compares with."""
 
 NETWORK = {"model.kernel_size": 3, "model.pooling": "avg"}
 """Options of its convolutional network (table I and section III-B), for which table II is."""
-
-
-def is_its_network(settings: Mapping[str, Any]) -> bool:
-    """Whether a run's configuration (dotted names) is of the network that table II is about."""
-    return all(settings.get(option) == value for option, value in NETWORK.items())
 
 
 TABLE_NOTE = (

@@ -17,7 +17,6 @@ from rcnn_odom.evaluation.sweep_report.options import (
     setting_of,
     show_value,
     swept_options,
-    value_of,
 )
 from rcnn_odom.evaluation.sweep_report.paper import VARIANTS
 
@@ -74,7 +73,7 @@ class Sweep:
     def label(self, setting: Values) -> str:
         """A setting for people, ``rcnn_reg, kernel_size=5``; the variant alone where nothing was swept."""
         if not self.options:
-            variants = (value_of(run, "model.variant") for run in self.runs if run.settings)
+            variants = (run.settings.get("model.variant") for run in self.runs if run.settings)
             return ", ".join(dict.fromkeys(map(show_value, variants)))
         names = [option.rsplit(".", 1)[-1] for option in self.options]
         parts = []

@@ -107,24 +107,19 @@ def reference_methods(sweep: Sweep) -> dict[str, list[Scores]]:
 
 
 def _drift_row(sweep: Sweep, label: str, seeds: str, scores: Sequence[Scores]) -> Row:
-    validation = _spread([one.get("val_drift") for one in scores])
+    validation = _metric_cell(DRIFT, [one.get("val_drift") for one in scores])
     return [label, seeds, validation, *_drift_cells(sweep, "drift", scores), number(_latency(scores))]
 
 
 def _drift_cells(sweep: Sweep, kind: str, scores: Sequence[Scores]) -> list[str]:
     """``drift`` or ``floor`` of each test sequence and their mean, in percent."""
     keys = [*(f"{kind}_{name}" for name in sweep.sequences), kind]
-    return [_spread([one.get(key) for one in scores]) for key in keys]
+    return [_metric_cell(DRIFT, [one.get(key) for one in scores]) for key in keys]
 
 
 def _latency(scores: Sequence[Scores]) -> float | None:
     """Of the fastest seed, in milliseconds: other jobs on a machine only ever slow it."""
     return min((one["latency_ms"] for one in scores if one.get("latency_ms") is not None), default=None)
-
-
-def _spread(ratios: Sequence[float | None]) -> str:
-    """Mean and deviation in percent of what is known."""
-    return _metric_cell(DRIFT, ratios)
 
 
 def drift_section(sweep: Sweep, figure: str) -> str:
@@ -148,8 +143,7 @@ def drift_section(sweep: Sweep, figure: str) -> str:
 
 def paper_section(sweep: Sweep) -> str:
     """The paper's table II beside ours, and what it claims of the swept options; empty for other drives."""
-    claims = [paper.CLAIMS[option] for option in sweep.options if option in paper.CLAIMS]
-    parts = ["## The paper", *claims]
+    parts = [paper.CLAIMS[option] for option in sweep.options if option in paper.CLAIMS]
     if sweep.sequences == paper.SEQUENCES:
         names = [*paper.SEQUENCES, "mean"]
         header = ["drift in %", *(f"ours, {name}" for name in names), "ours, s a frame"]
@@ -163,7 +157,7 @@ def paper_section(sweep: Sweep) -> str:
             paper.TABLE_NOTE,
             f"{ours}: for orientation only.",
         ]
-    return "\n\n".join(parts) if len(parts) > 1 else ""
+    return "\n\n".join(["## The paper", *parts]) if parts else ""
 
 
 def _paper_rows(sweep: Sweep) -> list[Row]:
@@ -172,7 +166,7 @@ def _paper_rows(sweep: Sweep) -> list[Row]:
     for setting, runs in sweep.by_setting.items():
         variants = {run.metrics.variant for run in runs.values()}
         column = paper.VARIANTS.get(variants.pop()) if len(variants) == 1 else None
-        if column is None or not all(paper.is_its_network(run.settings) for run in runs.values()):
+        if column is None or not all(paper.NETWORK.items() <= run.settings.items() for run in runs.values()):
             continue
         left = {name: other for name, other in left.items() if other is not column}
         scores = _scores(runs.values())
@@ -186,7 +180,7 @@ def _paper_rows(sweep: Sweep) -> list[Row]:
 
 
 def _paper_cells(column: paper.PaperColumn) -> list[str]:
-    return [*(percent(drift) for drift in column.drift.values()), number(column.seconds, 3)]
+    return [*(percent(drift) for drift in column.drift), number(column.seconds, 3)]
 
 
 def metrics_table(sweep: Sweep) -> tuple[Row, list[Row]]:
@@ -227,7 +221,10 @@ def runs_section(sweep: Sweep, table: "pd.DataFrame") -> str:
     """Every run with its setting, scores, time and place; the time of all together."""
     shown = table.astype(object).where(table.notna(), None)
     labels = {run.name: sweep.label(setting_of(run, sweep.options)) for run in sweep.runs if run.settings}
-    header = ["run", "setting", "status", "seed", "drift %", "validation %", "training", "first stage"]
+    header = [
+        *("run", "setting", "status", "seed", "drift %", "validation %", "training", "first stage"),
+        "same training as",
+    ]
     rows = [
         [
             *(row["run"], labels.get(row["run"], DASH), row["status"], show_value(row["seed"])),
@@ -236,8 +233,8 @@ def runs_section(sweep: Sweep, table: "pd.DataFrame") -> str:
         ]
         for _, row in shown.iterrows()
     ]
-    header, names = [*header, "same training as"], ("run", "same training as")
-    lines = ["## Runs and their time", markdown_table(header, rows, words=3, names=names)]
+    table_of_runs = markdown_table(header, rows, words=3, names=("run", "same training as"))
+    lines = ["## Runs and their time", table_of_runs]
     own = table[table["same_as"].isna()]
     known = own["seconds"].notna().sum()
     total = own["seconds"].sum() + own["first_stage_seconds"].sum()

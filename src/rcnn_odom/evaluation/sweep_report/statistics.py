@@ -16,7 +16,7 @@ SCATTER = 1e-9
 
 
 def mean_sd(values: Sequence[float]) -> tuple[float | None, float | None]:
-    """Mean and sample standard deviation (divisor n-1); None for what so few values do not have."""
+    """Mean and sample standard deviation (divisor n-1); None if there are too few values."""
     mean = float(np.mean(values)) if len(values) else None
     return mean, float(np.std(values, ddof=1)) if len(values) > 1 else None
 

@@ -1,0 +1,140 @@
+"""What stands around a job: mistakes become one line and a status, in one process and in several."""
+
+import errno
+import logging
+import signal
+from types import SimpleNamespace
+
+import pytest
+from hydra.errors import HydraException
+from omegaconf import OmegaConf
+from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.training import job, processes
+from rcnn_odom.training.saving import Stopped
+
+
+@pytest.fixture(autouse=True)
+def alone(monkeypatch):
+    """What a command sets in its process is for that alone."""
+    monkeypatch.setattr(signal, "signal", lambda number, handler: signal.getsignal(number))
+    monkeypatch.setattr(logging, "raiseExceptions", logging.raiseExceptions)
+    monkeypatch.setattr(job, "_failed", [])
+
+
+def raising(error):
+    def run(*_):
+        raise error
+
+    return run
+
+
+@pytest.mark.parametrize(
+    ("error", "status", "line"),
+    [
+        (KeyboardInterrupt(), 130, ""),
+        (InputError("model.beta=0"), 1, ""),
+        (HydraException("no such group\n    full_key: data"), 1, "error: no such group\n"),
+        (PermissionError(13, "denied"), 1, "error: [Errno 13] denied; choose another outputs= or run_dir=\n"),
+    ],
+)
+def test_a_command_ends_with_a_status_and_a_line(capsys, error, status, line):
+    assert job.run_command(raising(error)) == status
+    assert capsys.readouterr().err == line
+
+
+def test_a_command_without_a_mistake_is_a_success():
+    assert job.run_command(lambda: None) == 0
+
+
+@pytest.fixture
+def hydra(monkeypatch, tmp_path):
+    """A function that makes Hydra tell of a job: what it gives to ``run_job``."""
+
+    def hydra(number="???", overrides=(), **choices):
+        told = {
+            "job": {"num": number},
+            "runtime": {"output_dir": str(tmp_path), "choices": choices},
+            "overrides": {"task": list(overrides)},
+        }
+        monkeypatch.setattr(job, "HydraConfig", SimpleNamespace(get=lambda: OmegaConf.create(told)))
+        return OmegaConf.create({"run_dir": ""})
+
+    return hydra
+
+
+def test_a_job_gets_its_folder(hydra, tmp_path):
+    assert job.run_job(lambda cfg: cfg.run_dir, hydra()) == str(tmp_path)
+
+
+def test_a_mistake_is_told_and_remembered(hydra, caplog):
+    assert job.run_job(raising(InputError("model.beta=0")), hydra()) is None
+    assert job.run_job(raising(OSError(errno.ENOSPC, "full")), hydra()) is None
+    assert "error: model.beta=0" in caplog.text
+    assert "full; make room, and the same command goes on" in caplog.text
+    assert job.run_command(lambda: None) == 1
+
+
+def test_in_a_sweep_a_mistake_is_also_written_down_and_raised(hydra, tmp_path):
+    with pytest.raises(InputError):
+        job.run_job(raising(InputError("model.beta=0")), hydra(number=3))
+    assert (tmp_path / "error.txt").read_text() == "InputError: model.beta=0\n"
+    assert job.run_job(lambda cfg: 5, hydra(number=3)) == 5
+    assert not (tmp_path / "error.txt").exists()
+
+
+def test_options_of_a_sweep_and_of_a_run_are_not_for_the_other(hydra, caplog):
+    with pytest.raises(InputError, match="run_dir= is one run's"):
+        job.run_job(lambda cfg: 5, hydra(number=0, overrides=["run_dir=here"]))
+    assert job.run_job(lambda cfg: 5, hydra(sweeps="table2")) is None
+    assert "+sweeps= needs -m" in caplog.text
+
+
+def test_faults_of_the_program_and_stops_go_on(hydra):
+    with pytest.raises(KeyError):
+        job.run_job(raising(KeyError("fault")), hydra())
+    with pytest.raises(KeyboardInterrupt):
+        job.run_job(raising(SystemExit(1)), hydra())
+
+
+# --- several processes ---------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("traceback", "expected", "message"),
+    [
+        ("Traceback\nrcnn_odom.errors.InputError: 00: cut off", InputError, "^00: cut off$"),
+        ("Traceback\nOSError: no space", InputError, "^no space; make room, and the same command goes on$"),
+        ("Traceback\nrcnn_odom.training.saving.Stopped", Stopped, "^$"),
+        ("Traceback\nKeyError: 'fault'", ProcessRaisedException, "fault"),
+    ],
+)
+def test_an_error_of_another_process_is_as_of_this_one(traceback, expected, message):
+    error = ProcessRaisedException(traceback, 0, 1234)
+    with pytest.raises(expected, match=message), processes.one_line_errors(SimpleNamespace(world_size=1)):
+        raise error
+
+
+def test_a_process_that_was_killed_is_told():
+    trainer = SimpleNamespace(world_size=1)
+    with pytest.raises(InputError, match="was killed"), processes.one_line_errors(trainer):
+        raise ProcessExitedException("killed", 0, 1234, -9)
+
+
+def test_a_signal_is_passed_on_once(monkeypatch):
+    handlers, ended = {}, []
+    monkeypatch.setattr(signal, "signal", handlers.__setitem__)
+    child = SimpleNamespace(terminate=lambda: ended.append("child"))
+    monkeypatch.setattr(processes.multiprocessing, "active_children", lambda: [child])
+
+    def train():
+        with processes.one_line_errors(SimpleNamespace(world_size=2)):
+            handlers[signal.SIGTERM](signal.SIGTERM, None)
+            assert ended == ["child"]
+            with pytest.raises(KeyboardInterrupt):
+                handlers[signal.SIGTERM](signal.SIGTERM, None)
+            raise ProcessExitedException("stopped", 0, 1234, 143)
+
+    with pytest.raises(Stopped):
+        train()
