@@ -25,7 +25,9 @@ def modules_in(package: str, last: tuple[str, ...] = ()) -> Iterator[ModuleType]
         yield import_module(f"{package}.{name}")
 
 
-def collect(what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], None]) -> dict[str, Any]:
+def collect(
+    what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], None], only: str | None = None
+) -> dict[str, Any]:
     """Everything of one kind by its name: the project's own, and those that entry points add.
 
     Args:
@@ -33,6 +35,7 @@ def collect(what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], 
             ``rcnn_odom.models``, ``rcnn_odom.recording_formats`` or ``rcnn_odom.metrics``.
         built_in: the project's own.
         check: raises InputError where one that was added lacks a part.
+        only: of those that were added import the one of this name alone; the others are None.
 
     Raises:
         InputError: two have the same name, or one cannot be imported or lacks a part.
@@ -44,8 +47,10 @@ def collect(what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], 
                 f"two {what}s are called {entry.name}, one of them {entry.value}; rename it in the entry "
                 "points of its package"
             )
-        found[entry.name] = _load(what, entry)
-        check(entry.name, found[entry.name])
+        found[entry.name] = None
+        if only in (None, entry.name):  # what is broken in one package does not stop who asks for another
+            found[entry.name] = _load(what, entry)
+            check(entry.name, found[entry.name])
     return found
 
 

@@ -489,7 +489,7 @@ def test_a_foreign_configuration_is_refused(configure, tmp_path, content):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (["train.py", "data=kitti"], "data.root is missing"),
+        pytest.param(["train.py", "data=kitti"], "data.root is missing", marks=pytest.mark.slow),
         pytest.param(["train.py", "data=kitti", "data.root=nowhere"], "nowhere", marks=pytest.mark.slow),
         (["train.py", "model.kernel=3"], "Could not override 'model.kernel'"),
         (["train.py", "data=kiti"], "Could not find 'data/kiti'"),

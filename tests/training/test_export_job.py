@@ -34,6 +34,7 @@ def run(configure, kitti, tmp_path, trained):
     return shutil.copytree(trained, tmp_path / "copy" / "run")
 
 
+@pytest.mark.slow
 def test_export_prints_the_drift_of_each_precision(run, capsys, monkeypatch):
     monkeypatch.setattr(export_job, "ALLOWED", 1.0)  # two epochs on 60 frames: int8 may cost anything
     expected = json.loads((run / METRICS).read_text())["test"]["drift"]

@@ -112,8 +112,11 @@ def check_model(name: str, model: Any) -> None:
     raise InputError(f"model {name}: {problem}; docs/extending.md says what a model has")
 
 
-def all_models() -> dict[str, type[Model]]:
+def all_models(only: str | None = None) -> dict[str, type[Model]]:
     """Every model by its name; imports all of them, and so torch.
+
+    Args:
+        only: of those of other packages import the one of this name alone.
 
     Raises:
         InputError: two have the same name, or one lacks a part.
@@ -127,7 +130,7 @@ def all_models() -> dict[str, type[Model]]:
                     raise InputError(f"two models are called {member.name}; rename that of {module.__name__}")
                 check_model(member.name, member)
                 built_in[member.name] = member
-    return collect("model", built_in, check_model)
+    return collect("model", built_in, check_model, only)
 
 
 def find_model(name: str) -> type[Model]:
@@ -136,5 +139,5 @@ def find_model(name: str) -> type[Model]:
     Raises:
         InputError: there is none, or as :func:`all_models`.
     """
-    found: type[Model] = choose("model", name, all_models())
+    found: type[Model] = choose("model", name, all_models(only=name))
     return found

@@ -25,15 +25,18 @@ ASKED_LAST = ("carmen", "simulated")
 """One knows any file; the other streams nothing and takes a second to be imported."""
 
 
-def all_formats() -> dict[str, ModuleType]:
+def all_formats(only: str | None = None) -> dict[str, ModuleType]:
     """The formats by their names; imports all of them.
+
+    Args:
+        only: of those of other packages import the one of this name alone.
 
     Raises:
         InputError: one that another package adds has the name of another, or lacks a part.
     """
     modules = {module.__name__.rpartition(".")[2]: module for module in modules_in(PACKAGE)}
     own = {name: module for name, module in modules.items() if {"load", "recognises"} & set(dir(module))}
-    return collect(WHAT, own, _check)
+    return collect(WHAT, own, _check, only)
 
 
 def _check(name: str, module: Any) -> None:
@@ -53,7 +56,7 @@ def find_format(name: str) -> ModuleType:
     Raises:
         InputError: there is none, or it has no ``load``.
     """
-    found: ModuleType = choose(WHAT, name, all_formats())
+    found: ModuleType = choose(WHAT, name, all_formats(only=name))
     if not hasattr(found, "load"):
         raise InputError(
             f"recording format {name} has no load, so that it only streams; choose another data.reader.format"
