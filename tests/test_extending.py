@@ -49,10 +49,10 @@ def write_drives(folder):
         rows = []
         for stamp, (x, y, heading) in enumerate(poses_to_planar(compose(steps))):
             directions = bearings + heading
-            with np.errstate(divide="ignore"):
+            with np.errstate(divide="ignore", invalid="ignore"):
                 to_x = (np.sign(np.cos(directions)) * 12 - x) / np.cos(directions)
                 to_y = (np.sign(np.sin(directions)) * 9 - y) / np.sin(directions)
-            rows.append([0.1 * stamp, x, y, heading, *np.minimum(np.abs(to_x), np.abs(to_y))])
+            rows.append([0.1 * stamp, x, y, heading, *np.fmin(np.abs(to_x), np.abs(to_y))])
         np.savetxt(folder / f"{name}.scans", rows, delimiter=",")
 
 

@@ -1,5 +1,6 @@
 """Training and testing in two processes on the CPU."""
 
+import logging
 import os
 import signal
 import subprocess
@@ -75,6 +76,15 @@ def test_two_processes_score_as_one_and_log_once(configure, uneven, tmp_path, ca
     for tag in ("val/drift", "val/drift/09", "train/loss_epoch"):
         assert len(events.Scalars(tag)) == 3, tag
     assert min(point.value for point in events.Scalars("val/drift")) == pytest.approx(metrics["val"]["drift"])
+
+
+@pytest.mark.slow
+def test_a_first_stage_without_a_gradient_trains_in_two_processes(configure, uneven, caplog):
+    options = ["model=rcnn_reg", "model.angle=argmax", "model.epochs=2", "model.batch_size=2", "trainer=ddp"]
+    with caplog.at_level(logging.INFO):
+        metrics = train(configure(*options, *uneven))
+    assert metrics["training"]["epochs"] == 2
+    assert "argmax" in caplog.text
 
 
 @pytest.mark.slow

@@ -44,6 +44,8 @@ def test_it_is_evaluated_as_it_was(configure, old_run, tmp_path):
     metrics = evaluate(configure(f"run={old_run}", name="evaluate", run="evaluation"))
     assert metrics["variant"] == "cnn_reg"
     assert metrics["test"]["drift"] == pytest.approx(DRIFT, rel=1e-4)
+    assert 0 < metrics["coverage"]["05"]["heading"]["1"] <= 1
+    assert "distance" not in metrics["coverage"]["05"], "what lies sideways was not known then"
     trajectory = np.loadtxt(tmp_path / "outputs" / "evaluation" / "trajectories" / "05.txt")
     np.testing.assert_allclose(trajectory, np.loadtxt(OLD / "05.txt"), atol=1e-4)
 
