@@ -251,6 +251,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(trained, c
         ("data.val=['10[0.9:0.1]']", "two fractions"),
         ("data.val=['10[0.99:]']", "two are needed"),
         ("model.pooling=median", "choose one of avg, max"),
+        ("model.apply=start", "set data.apply"),
         ("model.kernel_size=4", "must be odd"),
         ("model.beta=much", "must be a number above 0"),
         ("model.epochs=0", "whole number above 0"),

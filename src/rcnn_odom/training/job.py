@@ -113,7 +113,9 @@ def run_command(main: Callable[[], object]) -> int:
     except (HydraException, OmegaConfBaseException, OSError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.
         message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
-        hint = "; choose another outputs= or run_dir=" if isinstance(error, OSError) else ""
+        # An unknown model= or data= is one of Hydra's errors and one of the system's.
+        is_folder = isinstance(error, OSError) and not isinstance(error, HydraException)
+        hint = "; choose another outputs= or run_dir=" if is_folder else ""
         for before, now in RENAMED.items():
             if f"'{before}" in message:
                 message = f"{before} has become {now}; set that"

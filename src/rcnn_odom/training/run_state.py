@@ -17,7 +17,7 @@ import yaml
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, RUNNING, read_metrics_file, read_settings
-from rcnn_odom.files import lock_if_free, write_atomically
+from rcnn_odom.files import lock_if_free, one_at_a_time, write_atomically
 from rcnn_odom.training.settings import Settings
 
 if TYPE_CHECKING:  # torch would make --help slow
@@ -275,10 +275,10 @@ def point_latest(outputs: Path, run: Path) -> None:
     if latest.is_symlink():  # as earlier versions left it
         latest.unlink()
     latest.mkdir(exist_ok=True)
-    for name in LINKED:
-        link = latest / f".{name}.{os.getpid()}"
-        link.symlink_to(os.path.relpath(run.resolve() / name, latest.resolve()))
-        try:
-            link.replace(latest / name)
-        finally:
+    # One process at a time, so that it never shows parts of two runs.
+    with one_at_a_time(outputs / "cache", "latest", "pointing outputs/latest to its run"):
+        for name in LINKED:
+            link = latest / f".{name}.link"
             link.unlink(missing_ok=True)
+            link.symlink_to(os.path.relpath(run.resolve() / name, latest.resolve()))
+            link.replace(latest / name)

@@ -105,6 +105,8 @@ def plain(cfg: DictConfig) -> Settings:
             data[split] = [str(name) for name in data[split]]
     _name_paths(settings)
     _check(settings, complete=True)
+    if (settings.get("model") or {}).get("apply", data.get("apply")) != data.get("apply"):
+        raise InputError("model.apply is that of the data, by which the floor is scored too; set data.apply")
     return settings
 
 
