@@ -156,7 +156,7 @@ def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
         axes.set(xlabel="length of the segment (m)", ylabel=name)
         axes.grid(alpha=0.3)
         axes.set_ylim(bottom=0)
-    columns = 1 if max(map(len, curves)) > 40 else min(len(curves), 4)
+    columns = max(1, min(len(curves), 4, 120 // (max(map(len, curves)) + 8)))  # as many as fit side by side
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     return figure
 
