@@ -59,7 +59,8 @@ def _load(what: str, entry: EntryPoint) -> Any:
         return entry.load()
     except Exception as error:  # whatever the code of a stranger's package does
         raise InputError(
-            f"{what} {entry.name}: {entry.value} cannot be imported ({type(error).__name__}: {error})"
+            f"{what} {entry.name}: {entry.value} cannot be imported ({type(error).__name__}: {error}); "
+            "correct or uninstall its package"
         ) from error
 
 

@@ -8,7 +8,9 @@ from types import SimpleNamespace
 import pytest
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
+from omegaconf.errors import InterpolationKeyError
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
+from yaml import YAMLError
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.training import job, processes
@@ -33,6 +35,9 @@ def raising(error):
 @pytest.mark.parametrize(
     ("error", "status", "line"),
     [
+        (InterpolationKeyError("no 'model.variant'"), 1, "error: no 'model.variant'\n"),
+        (YAMLError("expected ']'"), 1, "error: expected ']'\n"),
+        (ValueError("Config group override must be"), 1, "error: Config group override must be\n"),
         (KeyboardInterrupt(), 130, ""),
         (InputError("model.beta=0"), 1, ""),
         (HydraException("no such group\n    full_key: data"), 1, "error: no such group\n"),

@@ -18,6 +18,7 @@ from conftest import LENGTHS
 from evaluate import evaluate
 from rcnn_odom.cli import main
 from rcnn_odom.deployment.onnx_model import OnnxStepper
+from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST, CONFIG
 from rcnn_odom.evaluation.sweep_report import load_runs
 
@@ -54,6 +55,12 @@ def test_it_is_evaluated_on_other_data(configure, old_run):
     other = ["data=simulated", "data.frames=30", "data.test=[07]", "data.sensor.resolution_deg=8.0", LENGTHS]
     metrics = evaluate(configure(f"run={old_run}", *other, name="evaluate", run="evaluation"))
     assert metrics["test"]["sequences"]["07"]["frames"] == 30
+
+
+def test_its_steps_are_taken_where_it_was_trained_to(configure, old_run):
+    other = ["data=simulated", "data.frames=30", "data.test=[07]", "data.sensor.resolution_deg=8.0"]
+    with pytest.raises(InputError, match=r"data.apply=start: the network was trained with end"):
+        evaluate(configure(f"run={old_run}", *other, "data.apply=start", name="evaluate", run="evaluation"))
 
 
 def test_it_is_exported(old_run):

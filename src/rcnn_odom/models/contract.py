@@ -98,7 +98,10 @@ def check_model(name: str, model: Any) -> None:
     missing = [part for part in needed if not hasattr(model, part) or part in abstract]
     if not missing and is_dataclass(model.Options) and trains:
         given = {each.name for each in fields(model.Options)}
-        missing = [f"the option {each}" for each in sorted(RECIPE - given)]
+        wanted = RECIPE | ({"first_stage", "pretrained"} if model.first_stage else set())
+        missing = [f"the option {each}" for each in sorted(wanted - given)]
+        if model.first_stage and model.take_first_stage.__qualname__.startswith("TrainedModel."):
+            missing.append("take_first_stage")
     if missing:
         problem = f"lacks {', '.join(missing)}"
     elif not (inspect.isclass(model) and issubclass(model, Model)):

@@ -11,6 +11,7 @@ from contextlib import suppress
 from pathlib import Path
 from typing import TypeVar
 
+import yaml
 from hydra.core.hydra_config import HydraConfig
 from hydra.errors import HydraException
 from omegaconf import DictConfig, OmegaConf
@@ -28,6 +29,8 @@ Result = TypeVar("Result")
 
 NO_JOB_SUCCEEDED = "No trials are completed yet."
 """What Optuna says at the end of a sweep whose jobs have all failed."""
+HYDRAS_OWN = "Config group override"
+"""How Hydra's complaint about ``model=null`` begins, which is a plain ValueError."""
 
 _failed: list[Exception] = []
 
@@ -105,12 +108,7 @@ def run_command(main: Callable[[], object]) -> int:
         return 130
     except InputError:  # of a sweep's job, which has told
         return 1
-    except ValueError as error:
-        if not _failed or str(error) != NO_JOB_SUCCEEDED:
-            raise
-        print(f"error: {error}", file=sys.stderr)  # why each job failed is already logged
-        return 1
-    except (HydraException, OmegaConfBaseException, OSError) as error:
+    except (HydraException, OmegaConfBaseException, OSError, yaml.YAMLError) as error:
         # What follows is Hydra's own place in the configuration, not the user's mistake.
         message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
         # An unknown model= or data= is one of Hydra's errors and one of the system's.
@@ -120,5 +118,12 @@ def run_command(main: Callable[[], object]) -> int:
             if f"'{before}" in message:
                 message = f"{before} has become {now}; set that"
         print(f"error: {' '.join(message.split())}{hint}", file=sys.stderr)
+        return 1
+    except ValueError as error:
+        told = str(error).startswith(HYDRAS_OWN) or (_failed and str(error) == NO_JOB_SUCCEEDED)
+        if not told:
+            raise
+        # Why each job failed is already logged.
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         return 1
     return 1 if _failed else 0

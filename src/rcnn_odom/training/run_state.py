@@ -16,7 +16,15 @@ import numpy as np
 import yaml
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.run_folder import BEST, CONFIG, METRICS, RUNNING, read_metrics_file, read_settings
+from rcnn_odom.evaluation.run_folder import (
+    BEST,
+    CONFIG,
+    LAST,
+    METRICS,
+    RUNNING,
+    read_metrics_file,
+    read_settings,
+)
 from rcnn_odom.files import lock_if_free, one_at_a_time, write_atomically
 from rcnn_odom.training.settings import Settings
 
@@ -176,6 +184,8 @@ def entered(run: Path, settings: Settings) -> Iterator[None]:
         if (run / METRICS).exists():  # finished by another process since the first look
             _release(run)
             raise InputError(f"{run}: holds a finished run; choose another run_dir")
+        for left_over in (run / LAST).parent.glob(".*.partial"):  # of a process that was killed
+            left_over.unlink(missing_ok=True)
         write_config(run, settings)
     except OSError as error:
         raise InputError(f"{run}: cannot be written ({error.strerror}); choose another run_dir") from error
@@ -212,7 +222,7 @@ def fingerprints(settings: Settings, datamodule: "OdometryDataModule") -> Finger
 
     # Models and formats may come from other packages.
     parts = find_model(settings["model"]["variant"]), find_format(settings["data"]["reader"]["format"])
-    sources = [Path(inspect.getsourcefile(part) or "") for part in parts]
+    sources = [Path(source) for part in parts if (source := inspect.getsourcefile(part))]
     return Fingerprints(settings_fingerprint(settings, datamodule), code_fingerprint(PACKAGE, sources))
 
 
@@ -272,11 +282,11 @@ def write_json(path: Path, content: dict[str, Any]) -> None:
 def point_latest(outputs: Path, run: Path) -> None:
     """Lets ``latest`` among the runs show this one: a folder of links, also to what is not there yet."""
     latest = outputs / "latest"
-    if latest.is_symlink():  # as earlier versions left it
-        latest.unlink()
-    latest.mkdir(exist_ok=True)
     # One process at a time, so that it never shows parts of two runs.
     with one_at_a_time(outputs / "cache", "latest", "pointing outputs/latest to its run"):
+        if latest.is_symlink():  # as earlier versions left it
+            latest.unlink()
+        latest.mkdir(exist_ok=True)
         for name in LINKED:
             link = latest / f".{name}.link"
             link.unlink(missing_ok=True)

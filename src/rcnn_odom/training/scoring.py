@@ -53,6 +53,11 @@ def _score_run(chosen: Settings) -> tuple[Settings, Report]:
     settings |= {key: chosen[key] for key in ("data", "trainer", "outputs") if chosen.get(key)}
     trainer = build_trainer(settings)
     module = load_module(run / BEST, sensor=Sensor(**settings["data"]["sensor"]))
+    apply = settings["data"]["apply"]
+    if (trained := module.model.options.get("apply", apply)) != apply:
+        raise InputError(
+            f"data.apply={apply}: the network was trained with {trained}; set data.apply={trained}"
+        )
     datamodule = build_datamodule(settings).load(("test",))
     scores = score_module(module, datamodule, trainer, settings["data"], folder)
     of = {"run": os.path.relpath(home_of(run)), "variant": module.variant, "data": settings["data"]["name"]}

@@ -30,7 +30,7 @@ RENAMED = {
 
 def _names() -> Any:
     return option(
-        fits=lambda names: 0 < len(names) == len(set(names)),
+        fits=lambda names: 0 < len(names) == len(set(map(str, names))),
         wanted="a list of sequences, each once, for instance [a,b]",
     )
 
@@ -51,6 +51,10 @@ class AugmentOptions:
 class DataOptions:
     """What the files of ``conf/data`` have in common."""
 
+    reader: dict[str, Any] = option(  # noqa: RUF009
+        fits=lambda reader: isinstance(reader.get("format"), str),
+        wanted="the name of a format, data.reader.format, and the options of its load",
+    )
     sensor: Sensor
     augment: AugmentOptions
     train: list[Any] = _names()  # noqa: RUF009
@@ -115,9 +119,12 @@ def _check(settings: Settings, complete: bool) -> None:
     data, model = settings.get("data") or {}, dict(settings.get("model") or {})
     check_options(Options, settings, "", partly=True)
     check_options(DataOptions, data, "data.", partly=True)
-    if name := (data.get("reader") or {}).get("format"):
+    for group, key in (("data", "reader"), ("model", "variant")):
+        if complete and settings.get(group) and not settings[group].get(key):
+            raise InputError(f"{group}.{key} is missing; a file of conf/{group} must have it")
+    if name := data.get("reader", {}).get("format"):
         check_options(getattr(find_format(name), "Options", DataOptions), data, "data.", partly=True)
-    if variant := model.pop("variant", None):
+    if variant := str(model.pop("variant", "")):
         from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
 
         check_options(find_model(variant).Options, model, "model.", partly=not complete)
