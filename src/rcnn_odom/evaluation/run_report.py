@@ -1,7 +1,7 @@
 """What a scoring leaves behind: scores beside the baselines, trajectories, figures."""
 
 import logging
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -82,12 +82,7 @@ def report_drives(
     for drive in drives:
         others = {method: motions_of(every[drive.name].values) for method, every in baselines.items()}
         write_drive(drive, steps[drive.name], others, folder / "trajectories")
-    for title, figure in _figures(name, steps, drives, data["name"], test):
-        path = folder / "figures" / f"{title}.png"
-        path.parent.mkdir(parents=True, exist_ok=True)
-        figure.savefig(path, dpi=120)
-        if add_figure:
-            add_figure(f"test/{title}", figure)
+    _save_figures(_figures(name, steps, drives, data["name"], test), folder / "figures", add_figure)
     versions = {package: version(package) for package in PACKAGES}
     report = {"test": test, "baselines": reports, "latency": latency, "versions": versions}
     if shares:
@@ -149,6 +144,19 @@ def write_drive(drive: Drive, steps: Steps, baselines: Mapping[str, FloatArray],
     write_kitti(folder / f"{name}_truth.txt", drive.camera_poses)
     write_tum(folder / f"{name}.tum", drive.stamps, camera_poses)
     write_motions(folder / f"{name}_motions.csv", motions_of(steps.values), drive.motions, baselines)
+
+
+def _save_figures(
+    figures: Iterable[tuple[str, "Figure"]],
+    folder: Path,
+    add_figure: Callable[[str, "Figure"], None] | None,
+) -> None:
+    """Figures by their names as files, and to whoever else wants them."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for name, figure in figures:
+        figure.savefig(folder / f"{name}.png", dpi=120)
+        if add_figure:
+            add_figure(f"test/{name}", figure)
 
 
 def _figures(

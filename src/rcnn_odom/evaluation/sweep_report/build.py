@@ -9,6 +9,7 @@ from typing import Any
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.sweep_report.comparisons import (
+    Comparison,
     compare,
     difference_section,
     drifts_by_setting,
@@ -22,7 +23,8 @@ from rcnn_odom.evaluation.sweep_report.figures import (
     png,
     trajectories_section,
 )
-from rcnn_odom.evaluation.sweep_report.runs_table import read_sweep, runs_table
+from rcnn_odom.evaluation.sweep_report.options import Values
+from rcnn_odom.evaluation.sweep_report.runs_table import Sweep, read_sweep, runs_table
 from rcnn_odom.evaluation.sweep_report.sections import (
     drift_section,
     drift_table,
@@ -98,12 +100,17 @@ def make_report(
     paths = write_report(sweep.directory, f"Runs in {sweep.directory.resolve().name}", text, figures)
     tables = "\n\n".join(text_table(*table(sweep)) for table in (drift_table, metrics_table))
     unfinished = len(sweep.runs) - len(sweep.finished) + len(sweep.missing)
-    content = {
-        "runs": json.loads(table.dropna(axis="columns", how="all").to_json(orient="records")),
-        "comparisons": [
-            {"setting": sweep.label(one.setting), "against": sweep.label(chosen), "verdict": one.verdict}
-            | {**asdict(one.ratio), "p_holm": one.adjusted_p}
-            for one in comparisons
-        ],
-    }
+    rows = json.loads(table.dropna(axis="columns", how="all").to_json(orient="records"))
+    content = {"runs": rows, "comparisons": _comparison_rows(sweep, chosen, comparisons)}
     return Written(*paths, tables, unfinished, content)
+
+
+def _comparison_rows(
+    sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]
+) -> list[dict[str, Any]]:
+    """Comparisons with a setting, ready for JSON."""
+    return [
+        {"setting": sweep.label(one.setting), "against": sweep.label(reference), "verdict": one.verdict}
+        | {**asdict(one.ratio), "p_holm": one.adjusted_p}
+        for one in comparisons
+    ]
