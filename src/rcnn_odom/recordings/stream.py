@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, field
 
 from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray
+from rcnn_odom.recordings.beams import Beams
 from rcnn_odom.recordings.scan import Scan
 
 
@@ -17,7 +18,7 @@ class ScanStream:
         scans: in their order. Raises InputError where it breaks off.
         total: how many scans there are, if that is known.
         has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
-        beams: degrees that they cover, and degrees between them; None: as the bearings of a scan say.
+        beams: of the laser, where its scans are returns alone; None: as the bearings of a scan say.
         camera_from_laser: (4, 4), the frame in which trajectories are written.
         notes: what the reader noticed, in words for the user.
         skipped: what could not be read and was passed over, counted while ``scans`` is read.
@@ -27,7 +28,7 @@ class ScanStream:
     scans: Iterator[Scan]
     total: int | None = None
     has_clock: bool = True
-    beams: tuple[float, float] | None = None
+    beams: Beams | None = None
     camera_from_laser: FloatArray = field(default_factory=FORWARD_CAMERA.copy)
     notes: tuple[str, ...] = ()
     skipped: Counter[str] = field(default_factory=Counter)

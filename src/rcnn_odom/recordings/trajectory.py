@@ -13,6 +13,8 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings.packing import HEAD
+from rcnn_odom.recordings.text import refuse_utf16
 
 
 def file_name(sequence: str) -> str:
@@ -57,12 +59,14 @@ def read_lines(path: str | Path, wanted: str) -> list[str]:
         wanted: what it should be, for the message.
 
     Raises:
-        InputError: it cannot be read or is empty.
+        InputError: it cannot be read, is empty, or is text in UTF-16.
     """
     try:
-        lines = Path(path).read_text(encoding="utf-8", errors="replace").rstrip().splitlines()
+        content = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}; {wanted}") from error
+    refuse_utf16(path, content[:HEAD])
+    lines = content.decode("utf-8-sig", errors="replace").rstrip().splitlines()
     if not lines:
         raise InputError(f"{path}: is empty; {wanted}")
     return lines
