@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.models.encoding import Sensor, decode, encode
 from rcnn_odom.recordings.scan import Scan
 
 PAPER = Sensor()
@@ -16,7 +16,8 @@ NARROW = Sensor(resolution_deg=0.5, field_of_view_deg=90.0, max_range=20.0)
 
 def encoded_slowly(angles, ranges, sensor):
     """Every point looks for the bin whose centre is nearest; then the mean of each bin."""
-    centres = [i * sensor.resolution_deg - sensor.field_of_view_deg / 2 for i in range(sensor.bins)]
+    first = sensor.facing_deg - sensor.field_of_view_deg / 2
+    centres = [first + i * sensor.resolution_deg for i in range(sensor.bins)]
     found = [[] for _ in centres]
     for angle, depth in zip(np.degrees(angles), ranges, strict=True):
         if not (math.isfinite(angle) and math.isfinite(depth) and 0 < depth < sensor.max_range):
@@ -31,7 +32,12 @@ def encoded_slowly(angles, ranges, sensor):
     return np.array(vector)
 
 
-@pytest.mark.parametrize("sensor", [Sensor(1.0), Sensor(0.5, 360, 30), HALF_CIRCLE, NARROW, Sensor(1, 359)])
+LEFT, BEHIND = Sensor(1.0, 180.0, 40.0, facing_deg=90.0), Sensor(0.5, 90.0, 20.0, facing_deg=-180.0)
+
+
+@pytest.mark.parametrize(
+    "sensor", [Sensor(1.0), Sensor(0.5, 360, 30), HALF_CIRCLE, NARROW, Sensor(1, 359), LEFT, BEHIND]
+)
 @pytest.mark.parametrize("points", [0, 1, 60, 900])
 def test_encode_equals_slow_loop(sensor, points):
     rng = np.random.default_rng(points)
@@ -183,3 +189,23 @@ def test_beams_without_bearings_cover_the_field_of_view_evenly(sensor):
 def test_sensor_survives_plain_numbers():
     assert NARROW.as_dict() == {"resolution_deg": 0.5, "field_of_view_deg": 90.0, "max_range": 20.0}
     assert Sensor(**NARROW.as_dict()) == NARROW
+
+
+@pytest.mark.parametrize("sensor", [LEFT, BEHIND, HALF_CIRCLE])
+def test_points_of_a_sensor_that_faces_aside_are_where_they_were(sensor):
+    middle = np.deg2rad(sensor.facing_deg)
+    angles = middle + np.deg2rad([-40.0, 0.0, 25.0])
+    points = decode(encode(angles, [3.0, 4.0, 5.0], sensor), sensor)
+    expected = np.stack([np.cos(angles), np.sin(angles)], 1) * [[3.0], [4.0], [5.0]]
+    np.testing.assert_allclose(points, expected, atol=1e-6)
+    even = sensor.encode(Scan(np.full(sensor.bins, 6.0)))
+    np.testing.assert_array_equal(even, 6.0, err_msg="ranges alone are spread over its field of view")
+
+
+def test_a_sensor_that_faces_ahead_is_described_as_ever():
+    """Caches and checkpoints know it by these values."""
+    assert HALF_CIRCLE.as_dict() == {"resolution_deg": 1.0, "field_of_view_deg": 180.0, "max_range": 40.0}
+    assert LEFT.as_dict()["facing_deg"] == 90.0
+    assert Sensor(**LEFT.as_dict()) == LEFT
+    with pytest.raises(InputError, match=r"data\.sensor\.facing_deg must be -180 to 180, not 181"):
+        Sensor(facing_deg=181.0)

@@ -41,7 +41,7 @@ class Reader:
 def scan(seed, frame):
     rng = np.random.default_rng([seed, frame])
     bearings = rng.uniform(-np.pi, np.pi, 300)
-    return Scan(rng.uniform(0, 50, 300), bearings)
+    return Scan(rng.uniform(0, 50, 300), bearings, has_all_beams=False)
 
 
 @pytest.fixture
@@ -269,3 +269,48 @@ def wait_for(condition, seconds=20):
     while not condition():
         assert time.monotonic() < end, "waited in vain"
         time.sleep(0.1)
+
+
+@dataclass(frozen=True)
+class Sick:
+    """Scans of an even wall all round a laser whose beams are, for some frames, those of another."""
+
+    others: frozenset[int]
+    degrees: tuple[float, ...]
+
+    def __call__(self, frame):
+        degrees = self.degrees if frame in self.others else np.arange(-90.0, 91.0)
+        return Scan(np.full(len(degrees), 5.0), np.deg2rad(degrees))
+
+
+RIGHT_HALF = tuple(np.arange(-90.0, 1.0))
+
+
+def sick(frames, others, degrees=RIGHT_HALF):
+    return replace(make_sequence(Path(), frames=frames), read_scan=Sick(frozenset(others), degrees))
+
+
+def test_single_scans_of_other_beams_have_no_returns(tmp_path):
+    others = [0, 1, 50, 149]
+    (drive,) = encode_recordings([sick(150, others)], SENSOR, tmp_path, workers=2)
+    assert [frame for frame in range(150) if not drive.scans[frame].any()] == others
+    np.testing.assert_allclose(drive.scans[2], 5.0)
+
+
+@pytest.mark.parametrize(("frames", "others"), [(150, range(150)), (150, range(100, 150)), (3, range(3))])
+@pytest.mark.parametrize(
+    ("degrees", "says"),
+    [
+        (
+            np.arange(-90.0, 1.0),
+            "its beams lie from -90 to 0 degrees, one every 1, the sensor's from -90 to 90",
+        ),
+        (np.arange(0.0, 180.0), "set data.sensor.field_of_view_deg=180 .* data.sensor.facing_deg=90.0"),
+        (np.rad2deg(np.arange(-90.0, 91.0)), "more than a circle, as if its angles were not in radians"),
+    ],
+)
+def test_a_recording_of_another_laser_is_refused(tmp_path, frames, others, degrees, says):
+    with pytest.raises(InputError, match=says) as refused:
+        encode_recordings([sick(frames, others, tuple(degrees))], SENSOR, tmp_path / "cache", workers=1)
+    assert str(refused.value).startswith("drive0: frame ")
+    assert not list((tmp_path / "cache").glob("*.npy"))

@@ -16,9 +16,9 @@ from scipy.spatial.transform import Rotation
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, motions_of, relative_steps
 from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.recordings import kitti
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.simulated import FRAMES, load
+from rcnn_odom.recordings.velodyne import ring_starts
 from scans import beams
 
 WORLDS = ["street", "indoor"]
@@ -314,7 +314,7 @@ def test_points_are_one_ring_in_two_hundred_scans(world: str) -> None:
             points = sequence.read_scan.points(frame)
             azimuth = np.arctan2(points[:, 1], points[:, 0], dtype=np.float64) % (2 * np.pi)
             assert (np.diff(azimuth) >= 0).all()
-            assert len(kitti.ring_starts(points)) == 1
+            assert len(ring_starts(points)) == 1
 
 
 def test_street_is_seen_by_ring_7(streets) -> None:

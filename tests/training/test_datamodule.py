@@ -1,5 +1,7 @@
 """Windows, their sampler, the parts of recordings, and augmentation against a room that is drawn exactly."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -290,6 +292,28 @@ def test_module_reads_encodes_and_cuts(cache):
     expected = np.stack([look(pose, FULL) for pose in planar])
     np.testing.assert_allclose(module.drives["train"][0].scans, expected, rtol=1e-5)
     np.testing.assert_allclose(module.drives["test"][0].scans, expected[20:], rtol=1e-5)
+
+
+def test_a_recording_without_a_return_is_refused(tmp_path):
+    def open_dark(name):
+        nothing = Scan(np.full(360, 400.0), np.deg2rad(np.arange(-180.0, 180.0)))
+        return replace(open_room("short"), read_scan=([nothing] * 5).__getitem__, fingerprint="dark")
+
+    module = OdometryDataModule(open_dark, ["short"], ["short"], ["short"], FULL, tmp_path, workers=1)
+    with pytest.raises(
+        InputError, match=r"short: none of its 5 scans has a return: of their readings 1800 are at"
+    ):
+        module.load()
+
+
+def test_a_laser_that_faces_aside_has_no_mirror_image(cache):
+    aside = Sensor(1.0, 180.0, 40.0, facing_deg=90.0)
+    with pytest.raises(
+        InputError, match="the mirror image of a laser that faces 90 degrees is another laser"
+    ):
+        OdometryDataModule(open_room, [], [], [], aside, cache, mirror=True)
+    behind = Sensor(1.0, 180.0, 40.0, facing_deg=180.0)
+    assert OdometryDataModule(open_room, [], [], [], behind, cache, mirror=True).mirror
 
 
 def test_validation_and_test_are_whole_drives_in_order(cache):

@@ -1,6 +1,5 @@
 """Points of one revolution -> depth vector (paper III-A). Nothing else knows about bins."""
 
-import math
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -18,13 +17,15 @@ class Sensor:
 
     Attributes:
         resolution_deg: width of a bin in degrees.
-        field_of_view_deg: angle covered, in degrees, symmetric about straight ahead.
+        field_of_view_deg: angle covered, in degrees.
         max_range: metres; readings at or beyond it are absent returns, not walls.
+        facing_deg: direction of the middle of what is covered, counter-clockwise from straight ahead.
     """
 
     resolution_deg: float = option(default=0.1, above=0)
     field_of_view_deg: float = option(default=360.0, above=0)
     max_range: float = option(default=80.0, above=0)
+    facing_deg: float = option(default=0.0, least=-180.0, wanted="a number of degrees from -180 to 180")
 
     def __post_init__(self) -> None:
         steps = self.field_of_view_deg / self.resolution_deg if self.resolution_deg > 0 else 0.0
@@ -33,6 +34,8 @@ class Sensor:
                 f"sensor: a field of view of {self.field_of_view_deg} degrees (at most 360) has no "
                 f"whole number of bins of {self.resolution_deg} degrees; change data.sensor"
             )
+        if not -180 <= self.facing_deg <= 180:
+            raise InputError(f"sensor: data.sensor.facing_deg must be -180 to 180, not {self.facing_deg}")
         if not 0 < self.max_range < float("inf"):
             raise InputError(
                 f"sensor: data.sensor.max_range must be positive and finite, not {self.max_range}"
@@ -43,6 +46,11 @@ class Sensor:
         """Length of the depth vector: 3601 for the paper's sensor, the last bin closing the circle."""
         return round(self.field_of_view_deg / self.resolution_deg) + 1
 
+    @property
+    def first_bin_deg(self) -> float:
+        """Direction of the middle of the first bin, at the clockwise end of the field of view."""
+        return self.facing_deg - self.field_of_view_deg / 2
+
     def encode(self, scan: Scan) -> npt.NDArray[np.float32]:
         """The depth vector (bins,) of a scan in metres.
 
@@ -50,19 +58,19 @@ class Sensor:
         """
         bearings = scan.bearings
         if bearings is None:
-            half, closes_circle = math.radians(self.field_of_view_deg) / 2, self.field_of_view_deg == 360
-            bearings = np.linspace(-half, half, len(scan.ranges), endpoint=not closes_circle)
+            low, high = np.deg2rad([self.first_bin_deg, self.first_bin_deg + self.field_of_view_deg]).tolist()
+            bearings = np.linspace(low, high, len(scan.ranges), endpoint=self.field_of_view_deg != 360)
         return encode(bearings, scan.ranges, self)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for checkpoints and cache keys."""
-        return asdict(self)
+        """Plain numbers, for checkpoints and cache keys; those of a laser that looks ahead as ever."""
+        return {key: value for key, value in asdict(self).items() if key != "facing_deg" or value}
 
 
 def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.NDArray[np.float32]:
     """Mean depth of the returns in every bin, 0 where there is none (paper III-A).
 
-    Bin i is centred on ``i * resolution - field_of_view / 2`` degrees from straight ahead,
+    Bin i is centred on ``facing - field_of_view / 2 + i * resolution`` degrees from straight ahead,
     counter-clockwise. On a full circle the first and the last bin are the same direction, backwards.
 
     Args:
@@ -78,7 +86,7 @@ def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.
         degrees = np.rad2deg(angles)
     returned = (ranges > 0) & (ranges < sensor.max_range) & np.isfinite(degrees)
     # Turned so that bin 0 begins at 0: rounding never splits the bin behind the laser.
-    turned = degrees[returned] + (sensor.field_of_view_deg + sensor.resolution_deg) / 2
+    turned = degrees[returned] + (sensor.resolution_deg / 2 - sensor.first_bin_deg)
     index = np.floor((turned % 360.0) / sensor.resolution_deg + 1e-9).astype(np.int64)
     closes_circle = sensor.field_of_view_deg == 360
     distinct = sensor.bins - 1 if closes_circle else sensor.bins
@@ -99,5 +107,5 @@ def decode(depth: npt.NDArray[np.float32], sensor: Sensor) -> npt.NDArray[np.flo
     """Points (P, 2) in metres, x ahead and y to the left, in the middles of bins (bins,) with a return."""
     distinct = depth[:-1] if sensor.field_of_view_deg == 360 else depth
     bins = np.flatnonzero(distinct)
-    angles = np.deg2rad(bins * sensor.resolution_deg - sensor.field_of_view_deg / 2)
+    angles = np.deg2rad(bins * sensor.resolution_deg + sensor.first_bin_deg)
     return depth[bins, None] * np.column_stack([np.cos(angles), np.sin(angles)])

@@ -110,7 +110,7 @@ class PointToLineICP:
         ranges = np.asarray(scan, dtype=np.float64)[: sensor.bins - closed]
         bins = np.flatnonzero((ranges > 0) & np.isfinite(ranges))
         ranges = ranges[bins]
-        angles = np.deg2rad(bins * sensor.resolution_deg - sensor.field_of_view_deg / 2)
+        angles = np.deg2rad(bins * sensor.resolution_deg + sensor.first_bin_deg)
         points = np.stack([ranges * np.cos(angles), ranges * np.sin(angles)], axis=1)
         spacing = np.median(np.diff(angles)) * ranges if len(bins) > 1 else ranges
         normals = np.empty_like(points)

@@ -17,23 +17,26 @@ from tqdm import tqdm
 from rcnn_odom.errors import InputError
 from rcnn_odom.files import one_at_a_time
 from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings import beams
 from rcnn_odom.recordings.recording import Drive, OpenRecording, Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.workers import Workers, useful_workers
 
 log = logging.getLogger(__name__)
 
-ENCODING_VERSION = 1
-"""Raised whenever ``rcnn_odom.models.encoding.encode`` gives other numbers for the same input."""
+ENCODING_VERSION = 2
+"""Raised whenever the same scans would be encoded to other numbers, or be refused."""
 CHECKSUM = hashlib.sha256
 """Of all that goes before it in a file of the cache, which it ends."""
 DAY = 86400.0
+FITTING_SENSOR = "set {}"
+"""What to do about beams that are not the sensor's; the options of one that fits come in between."""
 
 Encoded = tuple[npt.NDArray[np.float32], FloatArray]
 """Depth vectors (n, bins) and poses (n, 4, 4) of some frames of a drive."""
 
 
-class Encoder(Protocol):
+class Encoder(beams.Sensor, Protocol):
     """Turns scans into depth vectors, as :class:`rcnn_odom.models.encoding.Sensor` does."""
 
     @property
@@ -60,13 +63,24 @@ class Encoding:
         self._opened: dict[str, Recording] = {}
 
     def __call__(self, name: str, start: int, stop: int) -> Encoded:
-        """Frames start..stop-1 of one drive."""
+        """Frames start..stop-1 of one drive; a scan whose beams are not the sensor's has no returns.
+
+        Raises:
+            InputError: a frame cannot be read, or several in a row, or all, are not the sensor's.
+        """
         if name not in self._opened:
             # One is enough: a worker's pieces of a drive follow each other.
             self._opened = {name: self.open_recording(name)}
         recording = self._opened[name]
-        scans = [self.encoder.encode(recording.read_scan(frame)) for frame in range(start, stop)]
-        return np.stack(scans), recording.poses[start:stop]
+        check = beams.BeamCheck(self.encoder)
+        depths = np.zeros((stop - start, self.encoder.bins), np.float32)
+        for depth, frame in zip(depths, range(start, stop), strict=True):
+            scan = recording.read_scan(frame)
+            if not check(scan):
+                depth[:] = self.encoder.encode(scan)
+            elif check.is_for_good or (stop - start == len(recording) == check.in_a_row):
+                raise check.refusal(f"{name}: frame {frame}", FITTING_SENSOR)
+        return depths, recording.poses[start:stop]
 
 
 def cache_path(recording: Recording, encoder: Encoder, folder: Path) -> Path:

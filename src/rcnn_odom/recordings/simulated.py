@@ -158,8 +158,14 @@ def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> 
 
 
 def _laser(name: str, world: str, given: dict[str, Any]) -> Laser:
+    if given.get("facing_deg") and given.get("field_of_view_deg") != 360:
+        raise InputError(
+            f"simulated sequence {name}: its laser looks ahead; leave out data.sensor.facing_deg"
+        )
     if world == "indoor":
-        return scanner(**SENSORS[world] | given)
+        return scanner(
+            **{key: value for key, value in (SENSORS[world] | given).items() if key in SENSORS[world]}
+        )
     max_range = given.get("max_range", LONGEST_RANGE)
     if max_range > LONGEST_RANGE:
         raise InputError(

@@ -15,11 +15,15 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.recordings.parts import cut, parse_part
-from rcnn_odom.recordings.recording import Drive, OpenRecording
+from rcnn_odom.recordings.recording import Drive, OpenRecording, Recording
+from rcnn_odom.recordings.returns import AbsentReturns
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 from rcnn_odom.training.windows import Batches, FreshSampler, TrainingLoader, Windows, WindowSampler
 
 log = logging.getLogger(__name__)
+
+SAMPLED_FRAMES = 50
+"""Frames of a recording of which at least one must have a return."""
 
 
 class WholeDrives(Dataset):
@@ -78,6 +82,11 @@ class OdometryDataModule(L.LightningDataModule):
         self.names = {"train": train, "val": val, "test": test}
         self.window, self.batch_size, self.seed = window, batch_size, seed
         self.max_turn_bins, self.mirror = round(max_turn_deg / sensor.resolution_deg), mirror
+        if mirror and sensor.facing_deg % 180:
+            raise InputError(
+                f"data.augment.mirror=true: the mirror image of a laser that faces {sensor.facing_deg:g} "
+                "degrees is another laser; leave it out"
+            )
         self.workers = workers or os.cpu_count() or 1
         self.drives: dict[str, list[Drive]] = {}
         self.fresh_epochs, self.fresh_first = fresh_epochs, 0
@@ -89,8 +98,9 @@ class OdometryDataModule(L.LightningDataModule):
         """Opens and encodes the drives of these splits.
 
         Raises:
-            InputError: a split is empty; a recording is missing, damaged or shorter than a window; new
-                worlds are wanted in place of a part of a drive.
+            InputError: a split is empty; a recording is missing, damaged, of another laser than the sensor,
+                without a return or shorter than a window; new worlds are wanted in place of a part of a
+                drive.
         """
         self._check_names(splits)
         wanted = [parse_part(name) for split in splits for name in self.names[split]]
@@ -100,6 +110,8 @@ class OdometryDataModule(L.LightningDataModule):
             for note in recording.notes:
                 log.info("%s: %s", recording.name, note)
         encoded = encode_recordings(recordings, self.sensor, self.cache_dir, self.workers)
+        for recording, drive in zip(recordings, encoded, strict=True):
+            self._check_returns(recording, drive)
         whole = dict(zip(files, encoded, strict=True))
         for split in splits:
             self.drives[split] = [cut(whole, name) for name in self.names[split]]
@@ -117,6 +129,16 @@ class OdometryDataModule(L.LightningDataModule):
                     f"data.train={name}: new worlds come as whole drives; set data.fresh_worlds=false, "
                     f"or name {whole}"
                 )
+
+    def _check_returns(self, recording: Recording, drive: Drive) -> None:
+        """Refuses a recording in which nothing is seen, as sampled frames tell."""
+        frames = np.unique(np.linspace(0, len(drive) - 1, SAMPLED_FRAMES).astype(int))
+        if any(drive.scans[frame].any() for frame in frames):
+            return
+        absent = AbsentReturns(self.sensor.max_range)
+        for frame in frames:
+            absent.add(recording.read_scan(frame))
+        raise InputError(f"{recording.name}: {absent}; set data.sensor.max_range, or leave the recording out")
 
     def _check_windows(self) -> None:
         for drive in self.drives.get("train", []):

@@ -40,7 +40,7 @@ Inputs: scans (1, 2, {bins}) float32, the depth vectors of the earlier and the l
 Outputs: step (1, 3), where the later scan was taken, in the frame of the earlier one: x ahead and y to the
 left in metres and the counter-clockwise change of heading in radians; covariance (1, 3, 3), that of step, nan
 where unknown{state_out}.
-Depth vector: bin i of {bins} is centred on i * {resolution_deg} - {half_deg} degrees from straight ahead,
+Depth vector: bin i of {bins} is centred on i * {resolution_deg} + {first_deg} degrees from straight ahead,
 counter-clockwise, and {resolution_deg} degrees wide; it holds the mean range of the returns in it in metres,
 0 where there is none. Readings of {max_range} m or more, not positive or not finite are no returns.{circle}
 Poses, from x = y = heading = 0: x += cos(heading) * step_x - sin(heading) * step_y;
@@ -254,7 +254,7 @@ def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
     graph.doc_string = ABOUT.format(
         **sensor.as_dict(),
         bins=sensor.bins,
-        half_deg=sensor.field_of_view_deg / 2,
+        first_deg=sensor.first_bin_deg,
         state_in=f"; {names}, the network's state, zeros at first" if state else "",
         state_out=f"; {after}, the state for the next step" if state else "",
         circle=" The last bin repeats the first." if sensor.field_of_view_deg == 360 else "",
