@@ -12,6 +12,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import motions_of, poses_to_planar, relative_steps
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import kitti
+from rcnn_odom.recordings.velodyne import ring_starts
 from scans import beams
 
 DATA = SHARED / "data"
@@ -94,33 +95,6 @@ def test_fingerprint_changes_with_ring_and_files_only(root: Path) -> None:
     assert kitti.load("00", root=root, ring=0).fingerprint != first.fingerprint
     os.utime(scan_file(root, 3), ns=(1, 1))
     assert kitti.load("00", root=root).fingerprint != first.fingerprint
-
-
-# Rings
-
-
-def points_at(*azimuths_deg: float) -> np.ndarray:
-    angle = np.deg2rad(np.array(azimuths_deg))
-    return np.stack([10 * np.cos(angle), 10 * np.sin(angle), 0 * angle], axis=1).astype(np.float32)
-
-
-@pytest.mark.parametrize(
-    ("azimuths", "starts"),
-    [
-        ((1, 90, 180, 270, 359, 1, 90, 180, 270, 359), [0, 5]),
-        ((1, 90, 180, 270, 359.9, 0.1, 359.95, 0.2, 90, 180), [0, 5]),  # noise over the wrap
-        ((359.9, 0.1, 359.8, 1, 90, 200, 350, 2, 90), [0, 7]),  # noise at the beginning
-        ((1, 90, 179.9, 180.1, 179.95, 180.2, 300, 2), [0, 7]),  # noise straight behind
-        ((1, 60, 53, 100, 270, 2), [0, 5]),  # parallax of a close object
-        ((10, 170, 20, 160, 15), [0, 2, 4]),  # rings that see only the left
-        ((200, 300, 190, 310), [0, 2]),  # rings that see only the right
-        ((100, 320, 5, 200), [0, 2]),  # gaps of more than half a turn within a ring
-        ((5, 200, 100, 330), [0, 2]),
-        ((5,), [0]),
-    ],
-)
-def test_ring_starts(azimuths: tuple[float, ...], starts: list[int]) -> None:
-    assert kitti.ring_starts(points_at(*azimuths)).tolist() == starts
 
 
 # Bad input
@@ -229,7 +203,7 @@ def test_frame_without_the_ring(root: Path) -> None:
             kitti.load("00", root=root, ring=ring)
     sequence = kitti.load("00", root=root, ring=3)
     points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
-    points[: kitti.ring_starts(points)[2]].tofile(scan_file(root, 1))
+    points[: ring_starts(points)[2]].tofile(scan_file(root, 1))
     with pytest.raises(InputError, match=r"000001\.bin: frame 1 has 2 rings, so no ring 3"):
         sequence.read_scan(1)
 
@@ -238,7 +212,7 @@ def test_points_that_are_not_finite_are_missing_returns(root: Path) -> None:
     sequence = kitti.load("00", root=root)
     angles, _ = beams(sequence.read_scan(1))
     points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
-    points[kitti.ring_starts(points)[LEVEL_RING] + 5] = np.nan
+    points[ring_starts(points)[LEVEL_RING] + 5] = np.nan
     points.tofile(scan_file(root, 1))
     again = kitti.load("00", root=root)
     assert again.notes == sequence.notes
@@ -249,7 +223,7 @@ def test_frame_with_a_ring_too_many_gives_the_same_laser(root: Path) -> None:
     sequence = kitti.load("00", root=root)
     expected = beams(sequence.read_scan(1))
     points = np.fromfile(scan_file(root, 1), "<f4").reshape(-1, 4)
-    first_ring = points[: kitti.ring_starts(points)[1]]
+    first_ring = points[: ring_starts(points)[1]]
     np.concatenate([first_ring, points]).tofile(scan_file(root, 1))
     for found, wanted in zip(beams(sequence.read_scan(1)), expected, strict=True):
         np.testing.assert_array_equal(found, wanted)

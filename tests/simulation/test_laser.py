@@ -6,7 +6,7 @@ import pytest
 from conftest import SHARED
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.recordings.kitti import ring_starts
+from rcnn_odom.recordings.velodyne import ring_starts
 from rcnn_odom.simulation.laser import hdl64_ring, scanner
 from rcnn_odom.simulation.scene import NO_WALLS, Material, Scene, Walls
 from rcnn_odom.simulation.terrain import Ground, flat_ground, stand

@@ -1,0 +1,299 @@
+"""KITTI raw data: a drive's folder, its truth from the GPS/IMU.
+
+Layout: ``DATE/DRIVE/{velodyne_points/{data/*.bin,timestamps.txt},oxts/data/*.txt}`` and, in ``DATE`` or
+``DRIVE``, ``calib_velo_to_cam.txt``, ``calib_cam_to_cam.txt`` and ``calib_imu_to_velo.txt``.
+"""
+
+import hashlib
+import os
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import TypeVar
+
+import numpy as np
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray
+from rcnn_odom.options import option
+from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.stream import ScanStream
+from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_lines
+from rcnn_odom.recordings.velodyne_files import VELODYNE, Scans, choose_beam, file_key, list_numbered
+
+READER_VERSION = 1
+"""Raised whenever the same files would give other scans."""
+
+VELODYNE_FOLDER = "velodyne_points"
+EARTH_RADIUS = 6378137.0
+"""Metres, as in the raw data's development kit."""
+SAME_MOMENT = 0.1
+"""Seconds: a pose that was measured further from its scan belongs to another one."""
+LISTED_DRIVES = 10
+STAMP = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?")
+
+T = TypeVar("T")
+
+
+@dataclass(kw_only=True)
+class Options:
+    """What ``conf/data/kitti_raw.yaml`` sets beside what all recordings have."""
+
+    ring: int | None = option(least=0, wanted="null or a whole number, not negative")
+
+
+def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
+    """One drive of the KITTI raw data.
+
+    The truth is that of the laser: the poses of the GPS/IMU, laid out flat by the development kit's Mercator
+    projection, are moved with ``calib_imu_to_velo.txt``. Ranges are horizontal, as of the odometry data.
+
+    Args:
+        name: folder of the drive, for instance ``"2011_09_26_drive_0005_sync"``.
+        root: folder that holds it, or the folders of dates that hold drives.
+        ring: which of the lasers, 0 the first in the file. None: the most level one.
+
+    Raises:
+        InputError: a file is missing, cut off or not as the format says.
+    """
+    drive = _find_drive(Path(root), name)
+    scans, notes = _list_scans(drive)
+    camera_from_laser, of_camera = _read_camera(drive)
+    frames = list(scans)
+    stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", frames)
+    poses = _read_truth(drive, frames, stamps)
+    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring)
+    key = f"kitti_raw {READER_VERSION} {reader.ring} {file_key(scans)}"
+    return Recording(
+        name=name,
+        poses=poses,
+        stamps=stamps,
+        read_scan=reader,
+        fingerprint=hashlib.sha256(key.encode()).hexdigest(),
+        camera_from_laser=camera_from_laser,
+        notes=(*notes, *of_camera, *chosen),
+    )
+
+
+def recognises(path: Path) -> bool:
+    """Whether it is a drive's folder, its ``velodyne_points`` or their ``data``, or holds drives."""
+    return _drive_of(path) is not None or bool(_drives_in(path))
+
+
+def stream(path: Path, ring: int | None = None) -> ScanStream:
+    """The scans of a drive, one after the other; its truth is not needed.
+
+    Args:
+        path: folder of the drive, or its ``velodyne_points``, or their ``data``.
+        ring: as for :func:`load`.
+
+    Raises:
+        InputError: a file is missing, cut off or not as the format says; or the folder holds several drives.
+    """
+    drive = _drive_of(path)
+    if drive is None:
+        raise InputError(f"{path}: holds drives of KITTI raw and is none itself; give one of {_listed(path)}")
+    scans, notes = _list_scans(drive)
+    if _find_calibration(drive, "calib_velo_to_cam.txt"):
+        camera_from_laser, of_camera = _read_camera(drive)
+    else:
+        camera_from_laser = FORWARD_CAMERA.copy()
+        of_camera = ("no calib_velo_to_cam.txt: trajectories are those of a camera in the laser's place",)
+    stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", list(scans))
+    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring)
+    return ScanStream(
+        name=drive.resolve().name,
+        scans=map(reader, range(len(scans))),
+        total=len(scans),
+        beams=VELODYNE,
+        camera_from_laser=camera_from_laser,
+        notes=(*notes, *of_camera, *chosen),
+    )
+
+
+def _drive_of(path: Path) -> Path | None:
+    """The folder of the drive to which a path belongs."""
+    if (path / VELODYNE_FOLDER).is_dir():
+        return path
+    whole = Path(os.path.abspath(path))
+    if whole.name == "data":
+        whole = whole.parent
+    return whole.parent if whole.name == VELODYNE_FOLDER and whole.is_dir() else None
+
+
+def _drives_in(folder: Path) -> list[str]:
+    """The drives of a date's folder, or of the folder of dates, as paths from there."""
+    found = [*folder.glob(f"*/{VELODYNE_FOLDER}"), *folder.glob(f"*_*_*/*/{VELODYNE_FOLDER}")]
+    return sorted(str(path.parent.relative_to(folder)) for path in found if path.is_dir())
+
+
+def _listed(folder: Path) -> str:
+    drives = _drives_in(folder)
+    more = f" and {len(drives) - LISTED_DRIVES} more" if len(drives) > LISTED_DRIVES else ""
+    return ", ".join(drives[:LISTED_DRIVES]) + more
+
+
+def _find_drive(root: Path, name: str) -> Path:
+    if not root.is_dir():
+        raise InputError(f"{root}: no such folder; set data.root to the folder that holds the drives")
+    places = [root / name, *(date / name for date in sorted(root.iterdir()))]
+    found = [place for place in places if place.is_dir()]
+    if not found or _drives_in(found[0]):
+        if (root / VELODYNE_FOLDER).is_dir():
+            there = "it is a drive itself: set data.root to the folder above"
+        elif drives := _listed(root):
+            there = f"set data.train, data.val and data.test to some of {drives}"
+        else:
+            there = "set data.root to the folder of dates or drives"
+        raise InputError(f"{root}: no drive {name} in it or in a date's folder; {there}")
+    if len(found) > 1 and found[0] != places[0]:
+        raise InputError(f"{root}: {found[0]} and {found[1]} are both {name}; name the date's folder too")
+    return found[0]
+
+
+def _list_scans(drive: Path) -> tuple[Scans, tuple[str, ...]]:
+    """The files of a drive's scans by frame number, at least one, and words about them."""
+    folder = drive / VELODYNE_FOLDER / "data"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; unpack the drive's Velodyne data, of its _sync archive")
+    scans, texts = list_numbered(folder, ".bin"), list_numbered(folder, ".txt")
+    if not scans and not texts:
+        raise InputError(f"{folder}: no .bin and no .txt file in it; unpack the drive's Velodyne data again")
+    notes = [f"{len(scans or texts)} scans"]
+    if scans and texts:
+        notes.append(f"{len(texts)} .txt files beside the .bin files are not read")
+    frames = list(scans or texts)
+    if lost := frames[-1] - frames[0] + 1 - len(frames):
+        notes.append(f"{lost} frame numbers between the first and the last have no scan")
+    return scans or texts, tuple(notes)
+
+
+def _match(path: Path, frames: list[int], found: Mapping[int, T], what: str) -> list[T]:
+    """What belongs to the frames: by their numbers if all are there, or else by position.
+
+    Raises:
+        InputError: the numbers are not all there, and there are not as many as frames.
+    """
+    if all(frame in found for frame in frames):
+        return [found[frame] for frame in frames]
+    if len(found) == len(frames):
+        return [found[number] for number in sorted(found)]
+    raise InputError(
+        f"{path}: {len(found)} {what} for {len(frames)} scans numbered {frames[0]} to {frames[-1]}; copy the "
+        "drive again, all of it"
+    )
+
+
+def _read_stamps(path: Path, frames: list[int]) -> FloatArray:
+    """Seconds since 1970, as if the clock's were UTC, of the frames."""
+    lines = read_lines(path, "unpack the drive again")
+    given = {number: line.strip() for number, line in enumerate(lines) if line.strip()}
+    places = _match(path, frames, {number: number for number in given}, "time stamps")
+    return np.array([_parse_stamp(f"{path}:{number + 1}", given[number]) for number in places])
+
+
+def _parse_stamp(where: str, text: str) -> float:
+    wanted = "a time stamp is like 2011-09-26 13:02:25.951199337; correct the line"
+    match = STAMP.fullmatch(text)
+    if match is None:
+        raise InputError(f"{where}: found '{text[:40]}', but {wanted}")
+    try:
+        whole = datetime.fromisoformat(match[1]).replace(tzinfo=UTC).timestamp()
+    except ValueError as error:
+        raise InputError(f"{where}: {error}, but {wanted}") from error
+    return (int(whole) * 10**9 + int((match[2] or "0").ljust(9, "0"))) / 10**9
+
+
+def _find_calibration(drive: Path, name: str) -> Path | None:
+    """A file of the date's calibration, in the drive's folder or in that of the date."""
+    places = (drive, Path(os.path.abspath(drive)).parent)
+    return next((folder / name for folder in places if (folder / name).is_file()), None)
+
+
+def _need_calibration(drive: Path, name: str) -> Path:
+    path = _find_calibration(drive, name)
+    if path is None:
+        raise InputError(
+            f"{drive}: no {name} in it or in the folder above; unpack the date's calibration there, "
+            "DATE_calib.zip"
+        )
+    return path
+
+
+def _read_camera(drive: Path) -> tuple[FloatArray, tuple[str, ...]]:
+    """The odometry data's ``Tr``, laser to rectified camera, (4, 4), and words about it."""
+    camera_from_laser = _read_transform(_need_calibration(drive, "calib_velo_to_cam.txt"))
+    path = _find_calibration(drive, "calib_cam_to_cam.txt")
+    if path is None:
+        return camera_from_laser, ("no calib_cam_to_cam.txt: the camera's frame is not rectified",)
+    rectified = np.eye(4)
+    rectified[:3, :3] = _read_rotation(path, "R_rect_00")
+    return rectified @ camera_from_laser, ()
+
+
+def _read_transform(path: Path) -> FloatArray:
+    transform = np.eye(4)
+    transform[:3, :3] = _read_rotation(path, "R")
+    transform[:3, 3] = _read_values(path, "T", 3)[1]
+    return transform
+
+
+def _read_rotation(path: Path, name: str) -> FloatArray:
+    where, values = _read_values(path, name, 9)
+    rotation = np.reshape(values, (3, 3))
+    if not is_rotation(rotation):
+        raise InputError(f"{where}: {name} holds no rotation; restore the original file")
+    return rotation
+
+
+def _read_values(path: Path, name: str, count: int) -> tuple[str, list[float]]:
+    """The numbers of the line of this name, and where it is."""
+    for number, line in enumerate(read_lines(path, "unpack the date's calibration again"), start=1):
+        if line.startswith(f"{name}:"):
+            where = f"{path}:{number}"
+            words = line[len(name) + 1 :].split()
+            return where, numbers(where, words, count, f"{name} has {count} finite numbers")
+    raise InputError(f"{path}: no line starts with '{name}:'; unpack the date's calibration again")
+
+
+def _read_truth(drive: Path, frames: list[int], stamps: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of the laser, the place of the GPS/IMU at the first scan the origin."""
+    folder = drive / "oxts" / "data"
+    if not folder.is_dir():
+        raise InputError(f"{folder}: no such folder; the truth is needed, so unpack the drive's oxts data")
+    laser_from_imu = _read_transform(_need_calibration(drive, "calib_imu_to_velo.txt"))
+    files = {int(path.stem): path for path in folder.glob("*.txt") if path.stem.isdecimal()}
+    chosen = _match(folder, frames, files, "files")
+    if (times := folder.parent / "timestamps.txt").is_file():
+        taken = _read_stamps(times, [int(path.stem) for path in chosen])
+        if (late := float(np.median(np.abs(taken - stamps)))) > SAME_MOMENT:
+            raise InputError(
+                f"{times}: the poses were measured {late:.1f} s from their scans; take the synchronised "
+                "drive, _sync, where equal numbers belong together"
+            )
+    return _imu_poses(np.array([_read_oxts(path) for path in chosen])) @ np.linalg.inv(laser_from_imu)
+
+
+def _read_oxts(path: Path) -> list[float]:
+    """Latitude and longitude in degrees, altitude in metres; roll, pitch and yaw in radians."""
+    wanted = "it begins with latitude, longitude, altitude, roll, pitch and yaw"
+    values = numbers(f"{path}:1", read_lines(path, "unpack the drive again")[0].split()[:6], 6, wanted)
+    if not (abs(values[0]) < 90 and abs(values[1]) <= 360 and abs(values[2]) < 1e5):
+        raise InputError(f"{path}:1: no place on earth, but {wanted}; correct the line")
+    return values
+
+
+def _imu_poses(rows: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4), x east and y north, of rows as :func:`_read_oxts` gives them (N, 6)."""
+    from scipy.spatial.transform import Rotation
+
+    latitude, longitude = np.deg2rad(rows[:, :2].T)
+    scale = EARTH_RADIUS * np.cos(latitude[0])
+    north = np.log(np.tan(np.pi / 4 + latitude / 2))
+    places = np.stack([scale * longitude, scale * north, rows[:, 2]], axis=1)
+    poses = np.tile(np.eye(4), (len(rows), 1, 1))
+    poses[:, :3, :3] = Rotation.from_euler("ZYX", rows[:, :2:-1]).as_matrix()
+    poses[:, :3, 3] = places - places[0]
+    return poses

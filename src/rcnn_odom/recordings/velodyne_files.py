@@ -1,0 +1,261 @@
+"""Numbered files of a Velodyne's points, one file a frame, as scans of one beam: both of KITTI's layouts."""
+
+import os
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings.beams import Beams
+from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.recordings.trajectory import read_lines
+from rcnn_odom.recordings.velodyne import (
+    HALF_RING_SPACING,
+    LEVEL,
+    NEAR_LEVEL,
+    Beam,
+    Points,
+    are_thinned,
+    find_level_beam,
+    fit_beam,
+    median_elevation,
+    points_at,
+    split_rings,
+)
+
+POINT_BYTES = 16
+VELODYNE = Beams(first=-180.0, covered=360.0, spacing=0.18)
+FARTHEST = np.float32(1e6)
+"""Metres: what claims to be farther away is no return."""
+SAMPLED_FRAMES = 20
+FRAMES_OF_BEAM = 5
+"""So many frames tell where a beam lies whose points come in any order."""
+
+Scans = dict[int, os.DirEntry[str]]
+"""Files by the numbers of their frames."""
+
+
+def list_numbered(folder: Path, suffix: str) -> Scans:
+    """The files of a folder that are called NUMBER and the suffix, their sizes checked; hidden ones left out.
+
+    Raises:
+        InputError: a file has no number or another one's, or is empty or cut off.
+    """
+    found: Scans = {}
+    for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
+        stem, its_suffix = os.path.splitext(entry.name)
+        if its_suffix != suffix or stem.startswith("."):
+            continue
+        if not stem.isdecimal() or int(stem) in found:
+            raise InputError(
+                f"{entry.path}: scans must be numbered, 000000{suffix} and up, once each; rename it"
+            )
+        size = entry.stat().st_size
+        if size == 0 or (suffix == ".bin" and size % POINT_BYTES):
+            raise InputError(
+                f"{entry.path}: {size} bytes are no whole number of {POINT_BYTES}-byte points, so the file "
+                "is empty or cut off; download it again"
+            )
+        found[int(stem)] = entry
+    return dict(sorted(found.items()))
+
+
+def file_key(scans: Scans) -> str:
+    """Changes with any of the files."""
+    return "\n".join(f"{e.name} {e.stat().st_size} {e.stat().st_mtime_ns}" for e in scans.values())
+
+
+def read_points(path: str | Path) -> Points:
+    """The points of a frame, (P, 4 as a rule) float32 metres; what is not finite or absurdly far is left out.
+
+    Args:
+        path: ``.bin``, four 32-bit floats a point, or ``.txt``, a line ``x y z reflectance`` for each.
+
+    Raises:
+        InputError: it cannot be read, or a line (which is named) holds something else.
+    """
+    if Path(path).suffix == ".txt":
+        points = _read_text(path)
+        return points[(np.abs(points[:, :3]) < FARTHEST).all(1)].astype(np.float32)
+    try:
+        values = np.fromfile(path, dtype="<f4")
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read ({error.strerror}); download it again") from error
+    if len(values) == 0 or len(values) % 4:
+        raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
+    points = values.reshape(-1, 4)
+    if values.max() < FARTHEST and values.min() > -FARTHEST:
+        return points  # the usual file, seen in a tenth of the time
+    # A point that is not finite is how some drivers write a missing return.
+    return points[(np.abs(points[:, :3]) < FARTHEST).all(1)]
+
+
+def _read_text(path: str | Path) -> FloatArray:
+    lines = read_lines(path, "download it again")
+    try:
+        points: FloatArray = np.loadtxt(lines, ndmin=2, comments=None)
+    except ValueError as error:
+        for number, line in enumerate(lines, start=1):
+            if line.strip() and not _is_point(line, len(lines[0].split())):
+                raise InputError(f"{path}:{number}: {_no_point(line)}") from error
+        raise InputError(f"{path}: its lines are no points ({error}); download it again") from error
+    if points.shape[1] < 3:
+        raise InputError(f"{path}:1: {_no_point(lines[0])}")
+    return points
+
+
+def _no_point(line: str) -> str:
+    return f"'{line.strip()[:40]}' is no point, x y z reflectance; correct the line"
+
+
+def _is_point(line: str, columns: int) -> bool:
+    try:
+        return len([float(word) for word in line.split()]) == columns >= 3
+    except ValueError:
+        return False
+
+
+def choose_beam(
+    paths: Iterable[str | Path], stamps: FloatArray, ring: int | None
+) -> tuple["BeamReader", tuple[str, ...]]:
+    """The reader of one beam for all frames, and words about it.
+
+    Args:
+        paths: of the frames, at least one.
+        stamps: (N,) seconds.
+        ring: which of the lasers, 0 the first in the file. None: the most level one, see ``LEVEL``.
+
+    Raises:
+        InputError: a file cannot be read, there is no such ring, or none near level.
+    """
+    files = tuple(map(str, paths))
+    frames = np.unique(np.linspace(0, len(files) - 1, SAMPLED_FRAMES).round().astype(int))
+    clouds = [read_points(files[frame]) for frame in frames]
+    ringed = [rings for cloud in clouds if (rings := split_rings(cloud)) is not None]
+    if 2 * len(ringed) < len(clouds):
+        disordered = [cloud for cloud in clouds if split_rings(cloud) is None]
+        return _by_elevation(files, stamps, ring, disordered)
+    elevations = _ring_elevations(ringed)
+    chosen, elevation = _choose_ring(elevations, ring, files[0])
+    usual = [rings[chosen] for rings in ringed if len(rings) == len(elevations) and len(rings[chosen])]
+    beam = fit_beam(np.concatenate(usual)) if usual else Beam(elevation)
+    notes = [f"ring {chosen} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"]
+    if others := len(clouds) - len(ringed):
+        notes.append(
+            f"points of {others} in {len(clouds)} frames are not laser by laser; their ring is taken by "
+            "elevation"
+        )
+    return BeamReader(files, tuple(stamps.tolist()), beam, chosen, elevation), tuple(notes)
+
+
+def _by_elevation(
+    files: tuple[str, ...], stamps: FloatArray, ring: int | None, clouds: list[Points]
+) -> tuple["BeamReader", tuple[str, ...]]:
+    if ring is not None:
+        raise InputError(
+            f"{files[0]}: its points do not come laser by laser, so there is no ring {ring}; leave out "
+            "data.ring (of rcnn-odom run: --ring) for the most level beam"
+        )
+    clouds = clouds[:: -(-len(clouds) // FRAMES_OF_BEAM)]
+    try:
+        beam = find_level_beam(clouds)
+    except ValueError as error:
+        raise InputError(
+            f"{files[0]}: its points do not come laser by laser, and {error}; give the points as the laser "
+            "gave them, all of them and in its own frame"
+        ) from error
+    beams = [points_at(cloud, *beam) for cloud in clouds]
+    elevation = np.rad2deg(median_elevation(np.concatenate(beams)))
+    notes = [f"points are not laser by laser; the beam at {elevation:+.2f} degrees is taken by elevation"]
+    if are_thinned(beams):
+        notes.append(
+            "points are thinned to a grid: scan matching bears that, but paths of networks that were trained "
+            "on all points come out 10 % short and more"
+        )
+    return BeamReader(files, tuple(stamps.tolist()), beam), tuple(notes)
+
+
+def _choose_ring(elevations: FloatArray, ring: int | None, path: str) -> tuple[int, float]:
+    if ring is not None and not 0 <= ring < len(elevations):
+        raise InputError(
+            f"data.ring must be 0 to {len(elevations) - 1}, not {ring} (of rcnn-odom run: --ring); left "
+            "out, it is the most level one"
+        )
+    chosen = int(np.argmin(np.abs(elevations - LEVEL))) if ring is None else ring
+    elevation = float(elevations[chosen])
+    if ring is None and abs(elevation - LEVEL) > NEAR_LEVEL:
+        raise InputError(
+            f"{path}: the most level of its {len(elevations)} rings lies at {np.rad2deg(elevation):+.1f} "
+            f"degrees, too far from level to see walls all round; if it is right, set data.ring={chosen} (of "
+            f"rcnn-odom run: --ring {chosen})"
+        )
+    return chosen, elevation
+
+
+def _ring_elevations(clouds: list[list[Points]]) -> FloatArray:
+    """Median elevation in radians of every ring over frames, each given as its rings."""
+    elevations = [[median_elevation(ring) for ring in rings] for rings in clouds]
+    usual = int(np.median([len(of_frame) for of_frame in elevations]))
+    # In single frames a neighbour can be nearer to horizontal: the median over frames settles on one.
+    return np.nanmedian([of_frame[:usual] for of_frame in elevations if len(of_frame) >= usual], axis=0)
+
+
+@dataclass(frozen=True)
+class BeamReader:
+    """Frame index -> the returns of one beam, their ranges horizontal.
+
+    A frame in which an earlier ring was split or lost has its rings elsewhere in the file: where the
+    ring's elevation (radians) is far from the sequence's, the neighbour that has it is taken. A frame whose
+    points do not come laser by laser gives those at the beam.
+
+    Attributes:
+        paths: of the frames.
+        stamps: seconds of each.
+        beam: where the points of the laser lie.
+        ring: number of the laser in the file; None where no frame's points come laser by laser.
+        elevation: median of the ring's, seen from the origin.
+    """
+
+    paths: tuple[str, ...]
+    stamps: tuple[float, ...]
+    beam: Beam
+    ring: int | None = None
+    elevation: float = float("nan")
+
+    def __call__(self, frame: int) -> Scan:
+        """Reads one frame.
+
+        Raises:
+            InputError: the frame cannot be read or has no such ring.
+        """
+        path = self.paths[frame]
+        points = read_points(path)
+        rings = None if self.ring is None else split_rings(points)
+        if self.ring is None or rings is None:
+            return Scan.from_points(self._find_points(points, path), self.stamps[frame])
+        if self.ring >= len(rings):
+            raise InputError(
+                f"{path}: frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count "
+                "from 0); choose a smaller data.ring, or download the file again"
+            )
+        return Scan.from_points(self._find_ring(rings, self.ring), self.stamps[frame])
+
+    def _find_ring(self, rings: list[Points], number: int) -> Points:
+        def distance(ring: Points) -> float:
+            return abs(median_elevation(ring) - self.elevation)
+
+        if distance(rings[number]) < HALF_RING_SPACING:
+            return rings[number]
+        return min(rings[max(number - 1, 0) : number + 2], key=distance)
+
+    def _find_points(self, points: Points, path: str) -> Points:
+        found = points_at(points, *self.beam)
+        if len(points) and not len(found):
+            raise InputError(
+                f"{path}: its points do not come laser by laser, and none is at the "
+                f"{np.rad2deg(self.beam.elevation):+.2f} degrees of the other frames' beam; download it again"
+            )
+        return found
