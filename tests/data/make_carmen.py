@@ -2,15 +2,19 @@
 
 import bz2
 import gzip
+import lzma
 from pathlib import Path
 
 import numpy as np
+import zstandard
 
 from data.make_kitti import cast, drive, world
 
 MAX_READING = 81.91
 LASER_AHEAD = 0.2
 """Metres from the robot to its laser, straight ahead, on ROBOTLASER1 lines."""
+
+PACKINGS = {"gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": zstandard.compress}
 
 
 def make_carmen(
@@ -22,7 +26,7 @@ def make_carmen(
     compress: str | None = None,
     seed: int = 0,
 ) -> np.ndarray:
-    """Write ``root/NAME.log``, ``.gz`` or ``.bz2`` added; returns the laser's x, y, heading, (frames, 3).
+    """Write ``root/NAME.log``, with the ending of a packing; returns the laser's x, y, heading, (frames, 3).
 
     0.1 to 0.3 m a frame and turns of up to 4 degrees. The laser pose on a line is the truth; odometry
     runs 2 % long and turns a little. One beam in a hundred gives no return (the maximal reading).
@@ -53,9 +57,9 @@ def make_carmen(
 
 
 def write_log(path: Path, lines: list[str], compress: str | None = None) -> Path:
-    """Write the lines, packed as asked for (None, "gz" or "bz2"); returns where."""
+    """Write the lines, packed as asked for (None or one of ``PACKINGS``); returns where."""
     content = ("\n".join(lines) + "\n").encode()
-    pack = {None: bytes, "gz": gzip.compress, "bz2": bz2.compress}[compress]
+    pack = PACKINGS[compress] if compress else bytes
     path = path if compress is None else path.with_name(f"{path.name}.{compress}")
     path.parent.mkdir(parents=True, exist_ok=True)
     path.write_bytes(pack(content))
