@@ -1,124 +1,247 @@
-"""ROS bags with LaserScan messages: ROS 1, ROS 2 sqlite3 and mcap, read by ``rosbags``; no ROS is needed."""
+"""ROS bags with LaserScan or PointCloud2 messages: ROS 1, ROS 2 sqlite3 and mcap; no ROS is needed.
+
+Only the topic that is asked for is looked at, and its messages are read by the types that ROS itself has:
+what a bag says about other topics, or about its types, cannot keep it from being read.
+"""
 
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from functools import cache
+from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.recordings.bags.chunks import BrokenBag
+from rcnn_odom.recordings.bags.files import MENDED_BY, Bag, is_bag, open_bag
+from rcnn_odom.recordings.bags.point_cloud import PLANE, Cloud, choose_cut, estimate_beams, read_cloud
+from rcnn_odom.recordings.bags.topics import LASER_SCAN, Topic, choose_topic, short_name
+from rcnn_odom.recordings.laser_scan import from_laser_scan
+from rcnn_odom.recordings.packing import import_zstd
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 
-SUFFIXES = (".bag", ".mcap", ".db3")
-METADATA = "metadata.yaml"
-"""What the folder of a ROS 2 bag holds."""
-LASER_SCAN = "sensor_msgs/msg/LaserScan"
+SAMPLED_CLOUDS = 20
+UNREADABLE = "messages that cannot be read"
+ZSTD = b"\x28\xb5\x2f\xfd"
+"""First bytes of a message that ROS 2 packed by itself."""
+
+T = TypeVar("T")
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is named like a bag, or is the folder of one."""
-    return path.suffix in SUFFIXES or (path / METADATA).exists()
+    """Whether it is a bag or the folder of one by its first bytes, or named like one."""
+    return is_bag(path)
 
 
-def stream(path: Path, topic: str | None = None) -> ScanStream:
-    """The LaserScan messages of a bag, in the order of their arrival.
+def stream(
+    path: Path,
+    topic: str | None = None,
+    ring: int | None = None,
+    height: tuple[float, float] | None = None,
+) -> ScanStream:
+    """The scans of a bag, in the order of their arrival.
 
-    Readings outside ``range_min`` to ``range_max`` are no returns. The stamp is the header's, or where
-    that is 0 the time of arrival. A message that cannot be read is skipped and counted.
+    The stamp is the header's, or where that is 0 the time of arrival. A message that cannot be read is
+    skipped and counted.
 
     Args:
-        path: a ``.bag``, ``.mcap`` or ``.db3`` file, or the folder of a ROS 2 bag.
-        topic: of the scans; None: the only one there is.
+        path: a file of a bag, packed or not; the folder of a ROS 2 bag, or the metadata.yaml in it.
+        topic: of the scans, with or without its first slash; None: the only one with LaserScan messages, or
+            where there is none with PointCloud2 messages.
+        ring: of point clouds, as they number them, or the row of clouds that lie in a grid; None: the most
+            level one.
+        height: metres from and to, in the frame of the cloud: a slice of point clouds instead of a ring.
 
     Raises:
-        InputError: the bag cannot be opened, has no LaserScan, or several topics of them.
+        InputError: the bag cannot be opened, has no such topic or several, or cannot be cut so.
     """
-    bag = _open(path)
-    topics = {name: info.msgtype for name, info in bag.topics.items()}
+    bag = open_bag(path)
     try:
-        topic = _choose(path, topic, topics)
-    except InputError:
+        chosen = choose_topic(path, bag, topic)
+        found = _stream_lasers if chosen.kind == LASER_SCAN else _stream_clouds
+        return found(path, bag, chosen, ring, height)
+    except BaseException:
         bag.close()
         raise
-    skipped: Counter[str] = Counter()
-    return ScanStream(
-        name=path.name,
-        scans=_scans(bag, topic, path, skipped),
-        total=bag.topics[topic].msgcount,
-        notes=(f"{bag.topics[topic].msgcount} scans of {topic}",),
-        skipped=skipped,
-    )
-
-
-def _open(path: Path) -> Any:
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    try:
-        bag = AnyReader([path], default_typestore=get_typestore(Stores.LATEST))
-        bag.open()
-    except Exception as error:  # whatever the bytes of a damaged bag lead to
-        raise InputError(
-            f"{path}: cannot be opened as a ROS bag ({_reason(error)}); a bag whose recording was cut off is "
-            "mended by 'rosbag reindex' or 'ros2 bag reindex', mcap by 'mcap recover'"
-        ) from error
-    return bag
-
-
-def _reason(error: Exception) -> str:
-    return (str(error) or type(error).__name__).splitlines()[0].rstrip(".")
-
-
-def _choose(path: Path, topic: str | None, topics: dict[str, str | None]) -> str:
-    lasers = sorted(name for name, kind in topics.items() if kind == LASER_SCAN)
-    if topic is None and len(lasers) == 1:
-        return lasers[0]
-    if topic is not None and topic in lasers:
-        return topic
-    if lasers:
-        wrong = f"no LaserScan topic {topic}" if topic else "several LaserScan topics"
-        raise InputError(f"{path}: {wrong}; choose one with --topic: {', '.join(lasers)}")
-    others = ", ".join(f"{name} ({kind})" for name, kind in sorted(topics.items())) or "none at all"
-    raise InputError(f"{path}: no topic with {LASER_SCAN}; its topics: {others}")
-
-
-def _scans(bag: Any, topic: str, path: Path, skipped: Counter[str]) -> Iterator[Scan]:
-    connections = [connection for connection in bag.connections if connection.topic == topic]
-    read = 0
-    try:
-        for connection, arrival, data in bag.messages(connections):
-            try:
-                scan = convert(bag.deserialize(data, connection.msgtype), arrival)
-            except Exception:  # whatever the bytes of a damaged message lead to
-                skipped["messages that cannot be read"] += 1
-                continue
-            yield scan
-            read += 1
-    except Exception as error:
-        raise InputError(
-            f"{path}: breaks off after {read} scans ({_reason(error)}); what came before is kept"
-        ) from error
-    finally:
-        bag.close()
 
 
 def convert(message: Any, arrival: int = 0) -> Scan:
-    """Beams of a LaserScan message, whose angles count as ours do (REP 103); 0 is no return (REP 117).
+    """The beams of a LaserScan message.
 
     Args:
         message: of ``rosbags`` or of ROS 2.
         arrival: nanoseconds, in place of a stamp of 0.
+
+    Raises:
+        ValueError: its angles do not say where its beams lie.
     """
-    ranges = np.asarray(message.ranges, dtype=np.float64)
-    beam = np.arange(len(ranges))
-    returned = (ranges >= message.range_min) & (ranges < message.range_max)
-    stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-    return Scan(
-        ranges=np.where(returned, ranges, 0.0),
-        bearings=message.angle_min + message.angle_increment * beam,
-        times=message.time_increment * beam if message.time_increment > 0 else None,
-        stamp=stamp or 1e-9 * arrival,
-        frame_id=message.header.frame_id,
+    return from_laser_scan(
+        message.ranges,
+        message.angle_min,
+        _angle_increment(message),
+        message.range_min,
+        message.range_max,
+        message.time_increment,
+        _stamp(message, arrival),
+        message.header.frame_id,
     )
+
+
+def _angle_increment(message: Any) -> float:
+    """Radians from beam to beam; some drivers leave it out, and the last beam's angle tells it."""
+    increment, gaps = float(message.angle_increment), len(message.ranges) - 1
+    if not np.isfinite(message.angle_min):
+        raise ValueError(f"its angle_min is {message.angle_min}")
+    if np.isfinite(increment) and increment != 0:
+        return increment
+    if gaps < 1:
+        return 0.0
+    extent = float(message.angle_max) - float(message.angle_min)
+    if not np.isfinite(extent) or extent == 0:
+        raise ValueError(f"its angle_increment is {increment:g} and its angle_max {message.angle_max:g}")
+    return extent / gaps
+
+
+def _stamp(message: Any, arrival: int) -> float:
+    stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+    return float(stamp or 1e-9 * arrival)
+
+
+def _stream_lasers(
+    path: Path, bag: Bag, topic: Topic, ring: int | None, height: tuple[float, float] | None
+) -> ScanStream:
+    if ring is not None or height is not None:
+        given = "ring" if height is None else "height"
+        raise InputError(
+            f"{path}: {topic.name} holds LaserScan messages, of which there is no {given} to choose; leave "
+            f"--{given} out, or choose a topic with PointCloud2 messages with --topic"
+        )
+    skipped: Counter[str] = Counter()
+    return ScanStream(
+        name=path.name,
+        scans=_close_after(bag, _read(path, bag, topic, convert, skipped)),
+        total=topic.messages,
+        notes=(f"{topic.messages} scans of {topic.name}",),
+        skipped=skipped,
+    )
+
+
+def _stream_clouds(
+    path: Path, bag: Bag, topic: Topic, ring: int | None, height: tuple[float, float] | None
+) -> ScanStream:
+    clouds = _sample_clouds(path, bag, topic)
+    try:
+        cut, about = choose_cut(clouds, ring, height)
+    except ValueError as error:
+        raise InputError(f"{path}: {topic.name} cannot be cut to a planar scan: {error}") from error
+
+    def to_scan(message: Any, arrival: int) -> Scan:
+        points = cut(read_cloud(message))
+        return Scan.from_points(points, _stamp(message, arrival), message.header.frame_id)
+
+    skipped: Counter[str] = Counter()
+    is_ring = height is None and any(np.ptp(cloud.points[:, 2]) > PLANE for cloud in clouds)
+    return ScanStream(
+        name=path.name,
+        scans=_close_after(bag, _read(path, bag, topic, to_scan, skipped)),
+        total=topic.messages,
+        beams=estimate_beams(clouds, cut) if is_ring else None,
+        notes=(f"{topic.messages} point clouds of {topic.name}", about),
+        skipped=skipped,
+    )
+
+
+def _sample_clouds(path: Path, bag: Bag, topic: Topic) -> list[Cloud]:
+    """The first clouds that have points.
+
+    Raises:
+        InputError: none can be read, or none has points.
+    """
+    sample: list[Cloud] = []
+    clouds = _read(path, bag, topic, lambda message, _: read_cloud(message), Counter())
+    try:
+        sample.extend(islice((cloud for cloud in clouds if len(cloud.points)), SAMPLED_CLOUDS))
+    except InputError:
+        if not sample:
+            raise
+    if not sample:
+        raise InputError(
+            f"{path}: none of the point clouds of {topic.name} has a point; choose another topic"
+        )
+    return sample
+
+
+def _close_after(bag: Bag, scans: Iterator[Scan]) -> Iterator[Scan]:
+    try:
+        yield from scans
+    finally:
+        bag.close()
+
+
+def _read(
+    path: Path, bag: Bag, topic: Topic, convert: Callable[[Any, int], T], skipped: Counter[str]
+) -> Iterator[T]:
+    """What becomes of each message of a topic that can be read.
+
+    Raises:
+        InputError: the bag breaks off, or not one message can be read.
+    """
+    read, why = 0, ""
+    try:
+        for encoding, arrival, content in bag.messages(topic.name, topic.kind):
+            try:
+                value = convert(_deserialize(content, encoding, topic.kind), arrival)
+            except ValueError as error:
+                skipped[UNREADABLE] += 1
+                why = why or str(error)
+                continue
+            yield value
+            read += 1
+    except (BrokenBag, OSError) as error:
+        kept = "what came before is kept; " if read else ""
+        raise InputError(f"{path}: breaks off after {read} scans ({error}); {kept}{MENDED_BY}") from error
+    if not read and skipped[UNREADABLE]:
+        raise InputError(
+            f"{path}: none of its {skipped[UNREADABLE]} messages of {topic.name} can be read ({why}); record "
+            "them again, or choose another topic"
+        )
+    if not read:
+        raise InputError(
+            f"{path}: no message of {topic.name} in it; choose another topic, or record it again"
+        )
+
+
+def _deserialize(content: memoryview, encoding: str, kind: str) -> Any:
+    """A message of a type of ROS out of its bytes.
+
+    Raises:
+        ValueError: they are none.
+    """
+    if encoding not in ("cdr", "ros1"):
+        raise ValueError(f"it is in {encoding}, not in cdr or ros1")
+    if encoding == "cdr" and content[:4] == ZSTD:
+        content = _unpack(content)
+    try:
+        return _deserializer(encoding)(content, kind)
+    except Exception as error:  # whatever the bytes of a damaged message lead to
+        raise ValueError(f"its {len(content)} bytes are no {short_name(kind)}") from error
+
+
+def _unpack(content: memoryview) -> memoryview:
+    zstd = import_zstd()
+    try:
+        return memoryview(zstd.decompress(content))
+    except zstd.ZstdError as error:
+        raise ValueError("it cannot be unpacked by zstd") from error
+
+
+@cache
+def _deserializer(encoding: str) -> Callable[[memoryview, str], Any]:
+    from rosbags.typesys import Stores, get_typestore
+
+    if encoding == "cdr":
+        return get_typestore(Stores.LATEST).deserialize_cdr
+    return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1  # where a header has a sequence number

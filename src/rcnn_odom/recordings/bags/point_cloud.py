@@ -1,0 +1,228 @@
+"""ROS's message PointCloud2 of a laser with many beams, cut to what one planar laser sees."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+import numpy.typing as npt
+
+from rcnn_odom.recordings.beams import Beams, find_beams
+
+TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
+"""Of fields, by the numbers of sensor_msgs/msg/PointField."""
+RING_FIELDS = ("ring", "channel")
+"""Names under which drivers write which of their lasers saw a point."""
+FARTHEST = 1e6
+"""Metres: what claims to be farther away is no return."""
+PLANE = 1e-3
+"""Metres between the lowest and the highest point of a laser that has a single plane."""
+SAME_BEAM_DEG = 0.01
+"""Bearings closer than this are of one beam, seen twice."""
+LEAST_POINTS = 30
+"""Of a cut cloud, to tell the spacing of its beams."""
+
+Points: TypeAlias = npt.NDArray[np.floating]
+
+
+class Cloud(NamedTuple):
+    """The returns of one revolution.
+
+    Attributes:
+        points: (P, 3) metres.
+        rings: by name of the numbering, (P,) the number of the ring of each point: ``ring`` as the message
+            has it; ``row`` and ``column`` of a cloud that lies in a grid.
+    """
+
+    points: Points
+    rings: dict[str, npt.NDArray[np.integer]]
+
+
+Cut: TypeAlias = Callable[[Cloud], Points]
+
+
+def read_cloud(message: Any) -> Cloud:
+    """The returns of a message PointCloud2; what is not finite, or lies in the laser itself, is none.
+
+    Raises:
+        ValueError: it has no x, y or z, or fewer bytes than it promises.
+    """
+    fields = {field.name: field for field in message.fields}
+    missing = [name for name in "xyz" if name not in fields]
+    if missing:
+        raise ValueError(f"it has no field {' and no '.join(missing)}, only {', '.join(fields) or 'none'}")
+    ring = next((name for name in RING_FIELDS if name in fields), None)
+    grid = _grid(message, [fields[name] for name in ("x", "y", "z", *((ring,) if ring else ()))])
+    points = np.stack([grid[name] for name in "xyz"], axis=-1)  # (rows, columns, 3)
+    seen = (np.abs(points) < FARTHEST).all(-1) & points.any(-1)  # not so of nan
+    rings = {}
+    if ring:
+        rings["ring"] = np.clip(np.nan_to_num(grid[ring][seen]), -1e9, 1e9).astype(np.int64)
+    if len(grid) > 1:
+        rings["row"], rings["column"] = np.nonzero(seen)
+    return Cloud(points[seen], rings)
+
+
+def _grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
+    """Some fields of the points, (rows, columns)."""
+    rows, columns, step = int(message.height), int(message.width), int(message.point_step)
+    order = ">" if message.is_bigendian else "<"
+    try:
+        layout = np.dtype(
+            {
+                "names": [field.name for field in fields],
+                "formats": [order + TYPES[int(field.datatype)] for field in fields],
+                "offsets": [int(field.offset) for field in fields],
+                "itemsize": step,
+            }
+        )
+    except (KeyError, ValueError) as error:
+        raise ValueError("its fields are of no known type, or lie outside of a point") from error
+    if rows * columns == 0:
+        return np.zeros((0, 0), layout)
+    # In a cloud of one row the length of a row says nothing, and some drivers leave it out.
+    row_step = step * columns if rows == 1 or message.row_step == 0 else int(message.row_step)
+    content = np.ascontiguousarray(message.data, dtype=np.uint8)
+    needed = (rows - 1) * row_step + columns * step
+    if row_step < columns * step or needed > len(content):
+        raise ValueError(
+            f"{rows} x {columns} points of {step} bytes do not fit into its {len(content)} bytes"
+        )
+    return np.ndarray((rows, columns), layout, content.data, strides=(row_step, step))
+
+
+def choose_cut(
+    clouds: Sequence[Cloud], ring: int | None = None, height: tuple[float, float] | None = None
+) -> tuple[Cut, str]:
+    """What makes a planar laser's points of each cloud of a recording, and words about it.
+
+    That is the ring nearest to level (see :mod:`rcnn_odom.recordings.velodyne`); of clouds that do not say
+    rings, the points at the elevation of the most level beam; of clouds in one plane all.
+
+    Args:
+        clouds: the first of the recording, each with points.
+        ring: another one than the most level one.
+        height: metres from and to, in the frame of the cloud: cuts a slice instead.
+
+    Raises:
+        ValueError: there is no such ring, no rings, or no beam near level; or ring and height are given.
+    """
+    if height is not None:
+        if ring is not None:
+            raise ValueError("a ring and a height are two ways to cut it; give one of them")
+        low, high = height
+        return lambda cloud: _between(cloud.points, low, high), f"points at heights of {low:g} to {high:g} m"
+    if ring is None and all(np.ptp(cloud.points[:, 2]) <= PLANE for cloud in clouds):
+        return lambda cloud: cloud.points, "all points, which lie in one plane"
+    numbering = _find_numbering(clouds)
+    if numbering is not None:
+        return _cut_ring(clouds, numbering, ring)
+    if ring is not None:
+        raise ValueError("its points do not say rings; leave the ring out, or cut at a height with --height")
+    return _cut_elevation(clouds)
+
+
+def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
+    """Where the beams lie that points are left of; None: the points do not tell.
+
+    What the laser covers is told by all points of the clouds, since one ring may have no return in a part.
+    """
+    spacings = [_spacing_deg(cut(cloud)) for cloud in clouds]
+    known = [spacing for spacing in spacings if spacing is not None]
+    if not known:
+        return None
+    seen = [np.unique(np.floor(np.rad2deg(_bearings(cloud.points)))) for cloud in clouds]
+    degrees = np.unique(np.concatenate(seen)) + 0.5
+    try:
+        found = find_beams(np.deg2rad(degrees))
+    except ValueError:
+        return None
+    return Beams(found.first, found.covered, float(np.median(known)))
+
+
+def _between(points: Points, low: float, high: float) -> Points:
+    return points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+
+
+def _find_numbering(clouds: Sequence[Cloud]) -> str | None:
+    """Which numbering of rings the clouds have; None: none.
+
+    Rings that are all the same are none. A grid's rings are its rows or its columns, whichever are more
+    level.
+    """
+    if all("ring" in cloud.rings for cloud in clouds):
+        numbers = np.concatenate([cloud.rings["ring"] for cloud in clouds])
+        if np.ptp(numbers) > 0:
+            return "ring"
+    if not all("row" in cloud.rings for cloud in clouds):
+        return None
+    spread = {
+        name: np.median([s for cloud in clouds for s in _of_rings(cloud, name, np.std).values()])
+        for name in ("row", "column")
+    }
+    return min(spread, key=lambda name: float(spread[name]))
+
+
+def _of_rings(cloud: Cloud, numbering: str, function: Callable[[Points], Any]) -> dict[int, float]:
+    """A function of the elevations (P,) in radians of each ring."""
+    rings = cloud.rings[numbering]
+    order = np.argsort(rings, kind="stable")
+    x, y, z = cloud.points[order].T.astype(np.float64)
+    numbers, starts = np.unique(rings[order], return_index=True)
+    elevations = np.split(np.arctan2(z, np.hypot(x, y)), starts[1:])
+    return {
+        int(number): float(function(of_ring)) for number, of_ring in zip(numbers, elevations, strict=True)
+    }
+
+
+def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tuple[Cut, str]:
+    from rcnn_odom.recordings.velodyne import LEVEL, NEAR_LEVEL
+
+    medians: dict[int, list[float]] = {}
+    for cloud in clouds:
+        for number, elevation in _of_rings(cloud, numbering, np.median).items():
+            medians.setdefault(number, []).append(elevation)
+    elevations = {number: float(np.median(values)) for number, values in medians.items()}
+    if ring is None:
+        ring = min(elevations, key=lambda number: abs(elevations[number] - LEVEL))
+        if abs(elevations[ring] - LEVEL) > NEAR_LEVEL:
+            raise ValueError(
+                f"no {numbering} is within 2 degrees of level, the nearest is {ring} at "
+                f"{np.rad2deg(elevations[ring]):+.1f}; choose one with --ring, or cut at a height with "
+                "--height"
+            )
+    elif ring not in elevations:
+        raise ValueError(
+            f"there is no {numbering} {ring}, they are {min(elevations)} to {max(elevations)}; choose "
+            "one of them"
+        )
+    chosen = ring
+
+    def cut(cloud: Cloud) -> Points:
+        if numbering not in cloud.rings:
+            raise ValueError(f"it has no {numbering}s")
+        return cloud.points[cloud.rings[numbering] == chosen]
+
+    return cut, f"{numbering} {ring}, median elevation {np.rad2deg(elevations[ring]):+.2f} degrees"
+
+
+def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
+    from rcnn_odom.recordings.velodyne import find_level_beam, median_elevation, points_at
+
+    try:
+        beam = find_level_beam([cloud.points for cloud in clouds])
+    except ValueError as error:
+        raise ValueError(f"{error}; cut at a height with --height") from error
+    elevation = np.rad2deg(median_elevation(np.concatenate([points_at(c.points, *beam) for c in clouds])))
+    about = f"the beam at {elevation:+.2f} degrees is taken by elevation, since the points say no rings"
+    return lambda cloud: points_at(cloud.points, *beam), about
+
+
+def _bearings(points: Points) -> npt.NDArray[np.float64]:
+    return np.arctan2(points[:, 1], points[:, 0], dtype=np.float64)
+
+
+def _spacing_deg(points: Points) -> float | None:
+    """Degrees between neighbouring beams; None: there are too few."""
+    gaps = np.diff(np.sort(np.rad2deg(_bearings(points))))
+    gaps = gaps[gaps > SAME_BEAM_DEG]
+    return float(np.median(gaps)) if len(gaps) >= LEAST_POINTS else None

@@ -1,0 +1,104 @@
+"""Which topic of a bag holds the scans."""
+
+from pathlib import Path
+from typing import NamedTuple
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.recordings.bags.files import MENDED_BY, Bag
+
+LASER_SCAN, POINT_CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
+
+
+class Topic(NamedTuple):
+    """What is read of a bag.
+
+    Attributes:
+        name: of the topic.
+        kind: type of its messages.
+        messages: how many there are.
+    """
+
+    name: str
+    kind: str
+    messages: int
+
+
+def choose_topic(path: Path, bag: Bag, wanted: str | None) -> Topic:
+    """The topic that is to be read.
+
+    Args:
+        path: of the bag, for errors.
+        bag: of which the topic is.
+        wanted: its name, with or without its first slash; None: the only one with LaserScan messages, or
+            where there is none with PointCloud2 messages. Without messages it does not count beside others.
+
+    Raises:
+        InputError: there is none, or several, or its messages are in an encoding that is not ROS's.
+    """
+    topics = _list_topics(bag)
+    lasers = [topic for topic in topics if topic.kind == LASER_SCAN]
+    clouds = [topic for topic in topics if topic.kind == POINT_CLOUD]
+    if wanted is not None:
+        found = [topic for topic in lasers + clouds if _is_called(topic, wanted)][:1]
+    else:
+        written = [[topic for topic in some if topic.messages] for some in (lasers, clouds)]
+        found = written[0] or written[1] or lasers or clouds
+    if len(found) != 1:
+        raise _refuse(path, bag, lasers, clouds, wanted, several=found)
+    _need_known_encoding(path, bag, found[0])
+    return found[0]
+
+
+def _list_topics(bag: Bag) -> list[Topic]:
+    return [
+        Topic(name, kind, count)
+        for name, kinds in sorted(bag.topics.items())
+        for kind, count in sorted(kinds.items())
+    ]
+
+
+def _is_called(topic: Topic, name: str) -> bool:
+    return topic.name.strip("/") == name.strip("/")
+
+
+def _refuse(
+    path: Path, bag: Bag, lasers: list[Topic], clouds: list[Topic], wanted: str | None, several: list[Topic]
+) -> InputError:
+    """Why no topic, or not one alone, is the one to be read."""
+    topics = _list_topics(bag)
+    if not lasers and not clouds:
+        if bag.broken:
+            return InputError(f"{path}: breaks off before any scan ({bag.broken}); {MENDED_BY}")
+        others = ", ".join(f"{topic.name} ({topic.kind or 'no type'})" for topic in topics) or "none at all"
+        return InputError(f"{path}: no topic with {LASER_SCAN} or {POINT_CLOUD}; its topics: {others}")
+    kinds = [topic.kind for topic in topics if wanted and _is_called(topic, wanted)]
+    if kinds:
+        wrong = f"{wanted} holds {kinds[0] or 'messages of no type'}, which is no scan"
+    elif wanted is not None:
+        wrong = f"no topic {wanted}"
+    else:
+        wrong = f"several {short_name(several[0].kind)} topics"
+    choice = " and ".join(_name_all(some) for some in (lasers, clouds) if some)
+    return InputError(f"{path}: {wrong}; choose one with --topic: {choice}")
+
+
+def _name_all(topics: list[Topic]) -> str:
+    return f"{', '.join(topic.name for topic in topics)} ({short_name(topics[0].kind)})"
+
+
+def short_name(kind: str) -> str:
+    """Of a type of messages.
+
+    >>> short_name(LASER_SCAN)
+    'LaserScan'
+    """
+    return kind.rpartition("/")[2]
+
+
+def _need_known_encoding(path: Path, bag: Bag, topic: Topic) -> None:
+    encodings = bag.encodings(topic.name, topic.kind)
+    if encodings.isdisjoint(("cdr", "ros1")):
+        raise InputError(
+            f"{path}: the messages of {topic.name} are in {', '.join(sorted(encodings))}, not in ROS's own "
+            "cdr or ros1; convert the bag to one of them"
+        )
