@@ -6,17 +6,15 @@
 Parameters: model (rcnn_small, an exported .onnx or a .ckpt), odom_frame (odom). Publishes /odom: the pose of
 the laser where its first scan is the origin, and as twist the last step over its time with the network's
 covariance. No TF is sent, since a robot's laser has a parent already. What an estimate suffers from (gaps,
-few returns) is logged as a warning; a late scan is not published. The file can be imported without ROS.
+few returns) is logged; a scan that is passed over is not published. The file can be imported without ROS.
 """
 
 import math
 from contextlib import suppress
 from itertools import product
 
-from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
-from rcnn_odom.recordings.formats import need_fitting_scan
+from rcnn_odom.deployment.odometer import PASSED_OVER, Odometer, Pose
 from rcnn_odom.recordings.rosbag import convert
-from rcnn_odom.recordings.stream import ScanStream
 
 AXES = (0, 1, 5)  # x, y and yaw among the six of a twist's covariance
 
@@ -52,17 +50,19 @@ def main() -> None:
         odometer = load_odometer(model, threads=1)
     else:
         odometer = Odometer.from_onnx(model)
-    publisher, last, fits = node.create_publisher(Odometry, "odom", 10), [], []
+    publisher, last = node.create_publisher(Odometry, "odom", 10), []
 
     def on_scan(message) -> None:
-        scan = convert(message, node.get_clock().now().nanoseconds)
-        if not fits and (scan.ranges > 0).any():  # raises InputError where the laser is not the model's
-            need_fitting_scan(ScanStream("scan", iter(())), scan, odometer.description.sensor)
-            fits.append(True)
+        try:
+            scan = convert(message, node.get_clock().now().nanoseconds)
+        except ValueError as error:
+            return node.get_logger().warning(f"no scan: {error}")
         pose = odometer.step(scan)
+        if odometer.beam_check.is_for_good:
+            raise odometer.beam_check.refusal("scan", "train a model for such a laser: python train.py {}")
         if pose.degraded:
             node.get_logger().warning(pose.degraded)
-        if pose.degraded.startswith(LATE):
+        if pose.degraded.startswith(PASSED_OVER):
             return
         odometry = Odometry(header=message.header, child_frame_id=message.header.frame_id)
         odometry.header.frame_id = frame

@@ -10,11 +10,13 @@ import pytest
 import torch
 
 from odometry import ANGLES, NAMES, build, random_scans
-from rcnn_odom.deployment.odometer import LATE_IN_A_ROW, LONGEST_HOLD, Odometer
+from rcnn_odom.deployment.clock import CLOCK_JUMP, LATE_IN_A_ROW
+from rcnn_odom.deployment.odometer import LONGEST_HOLD, Odometer
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import Step, advance, compose, poses_to_planar
 from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.beams import PATIENCE
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training.onnx_graph import to_onnx, write
 
@@ -185,11 +187,11 @@ def test_dropped_scans_are_bridged_and_the_state_survives(recorder):
 def test_over_a_long_gap_the_motion_ends(recorder):
     odometer = Odometer(recorder)
     last = drive(odometer, random_scans(6))[-1]
-    pose = odometer.step(random_scans(1)[0], 3600.0, ANGLES)
+    pose = odometer.step(random_scans(1)[0], 0.5 + CLOCK_JUMP - 0.1, ANGLES)
     assert math.hypot(pose.x - last.x, pose.y - last.y) <= LONGEST_HOLD * 0.5
     held = poses_to_planar(compose([Recorder.step] * LONGEST_HOLD))[-1]
     np.testing.assert_allclose(pose.step.array(), held)
-    assert pose.step.covariance[0, 0] > 1000**2
+    assert pose.step.covariance[0, 0] == pytest.approx((99 * 0.6) ** 2)
     odometer.reset()
     drive(odometer, random_scans(6))
     empty = [odometer.step(np.zeros(181), 0.1 * n) for n in range(6, 30)]
@@ -227,18 +229,112 @@ def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
     assert "beam count" in odometer.step(np.full(361, 5.0), 0.6).degraded, "of a scan that counts"
 
 
-@pytest.mark.parametrize("jump", [-1000.0, 1000.0])
-def test_a_clock_that_is_set_costs_a_few_scans(recorder, jump):
+@pytest.mark.parametrize("jump", [-1.7e9, -1000.0, -10.5, 10.5, 1000.0, 1.7e9])
+def test_over_a_jump_of_the_clock_no_motion_is_added(recorder, jump):
+    """Without a jump there would be 39 steps; over the one nobody knows, the rest is as if nothing were."""
+    odometer, scans = Odometer(recorder), random_scans(40)
+    before = drive(odometer, scans[:20])
+    after = [odometer.step(scan, 2.0 + jump + 0.1 * n, ANGLES) for n, scan in enumerate(scans[20:])]
+    assert after[0].degraded.startswith("clock set: from 1.9 to ")
+    assert (after[0].x, after[0].y, after[0].heading) == (before[-1].x, before[-1].y, before[-1].heading)
+    assert not after[0].step.array().any()
+    assert np.isnan(after[0].step.covariance).all(), "how far it went is unknown"
+    assert after[0].stamp == 2.0 + jump
+    assert [pose.degraded for pose in after[1:]] == [""] * 19
+    assert len(recorder.pairs) == 38
+    np.testing.assert_array_equal(recorder.pairs[19], scans[20:22])
+    assert recorder.resets == 1
+
+
+def test_a_clock_that_goes_back_a_little_costs_a_few_scans(recorder):
     odometer, scans = Odometer(recorder), random_scans(60)
     drive(odometer, scans[:20])
-    if jump > 0:  # one wild stamp, then the old clock again
-        odometer.step(scans[20], 2.0 + jump, ANGLES)
-    later = [odometer.step(scan, 2.1 + min(jump, 0) + 0.1 * n, ANGLES) for n, scan in enumerate(scans[21:])]
+    later = [odometer.step(scan, 2.1 - 5.0 + 0.1 * n, ANGLES) for n, scan in enumerate(scans[21:])]
     kinds = [pose.degraded.split(":")[0] for pose in later]
     assert kinds == ["late scan"] * (LATE_IN_A_ROW - 1) + ["gap"] + [""] * (39 - LATE_IN_A_ROW)
     held = poses_to_planar(compose([Recorder.step] * LATE_IN_A_ROW))[-1]
-    assert length(later[LATE_IN_A_ROW - 1]) in (pytest.approx(math.hypot(*held[:2])), 0.0)
+    assert length(later[LATE_IN_A_ROW - 1]) == pytest.approx(math.hypot(*held[:2]))
     assert recorder.resets == 1
+
+
+def test_one_wild_stamp_costs_two_steps(recorder):
+    odometer, scans = Odometer(recorder), random_scans(10)
+    stamps = [0.0, 0.1, 0.2, 1e6, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
+    poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
+    assert [pose.degraded.split(":")[0] for pose in poses] == [""] * 3 + ["clock set"] * 2 + [""] * 5
+    assert len(recorder.pairs) == 7
+
+
+@pytest.mark.parametrize("stamp", [0.0, 5.0])
+def test_a_clock_that_stands_still_is_none(recorder, stamp):
+    """A 0 at once; of another stamp the first four might have come late."""
+    odometer = Odometer(recorder)
+    poses = [odometer.step(scan, stamp, ANGLES) for scan in random_scans(30)]
+    kinds = [pose.degraded.split(":")[0] for pose in poses]
+    lost = 0 if stamp == 0 else LATE_IN_A_ROW - 1
+    assert kinds == ["", *["late scan"] * lost, *(["gap"] if lost else []), *[""] * (29 - lost - bool(lost))]
+    assert sum(map(length, poses)) == pytest.approx(0.5 * len(recorder.pairs))
+
+
+def test_a_stamp_of_zero_among_others_is_none(recorder):
+    odometer, scans = Odometer(recorder), random_scans(30)
+    stamps = [0.0 if n in (0, 7, 12, 13) else 1000 + 0.1 * n for n in range(30)]
+    poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
+    assert [bool(pose.degraded) for pose in poses] == [False, True, *[False] * 28]
+    assert "clock set" in poses[1].degraded, "a first stamp of 0 may be a time"
+
+
+def test_a_scan_of_another_frame_is_passed_over(recorder):
+    """Two lasers on one topic: the first one's scans are compared, the others' are not."""
+    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    frames = ["front", "rear", "/front", "rear", *["front", "rear"] * 8]
+    poses = [
+        odometer.step(Scan(scan, ANGLES, stamp=PERIOD / 2 * n, frame_id=frame))
+        for n, (scan, frame) in enumerate(zip(scans, frames, strict=True))
+    ]
+    for pose, frame in zip(poses, frames, strict=True):
+        assert pose.degraded == ("other frame: rear after front, passed over" if frame == "rear" else "")
+    assert poses[3].stamp == poses[2].stamp
+    np.testing.assert_array_equal(recorder.pairs, [scans[n : n + 3 : 2] for n in range(0, 18, 2)])
+    assert recorder.resets == 1
+
+
+def test_a_frame_that_changes_for_good_is_the_lasers(recorder):
+    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    poses = [
+        odometer.step(Scan(scan, ANGLES, stamp=0.1 * n, frame_id="front" if n < 8 else "laser_link"))
+        for n, scan in enumerate(scans)
+    ]
+    kinds = [pose.degraded.split(":")[0] for pose in poses]
+    assert kinds == [""] * 8 + ["other frame"] * (PATIENCE - 1) + ["new frame"] + [""] * 7
+    assert length(poses[12]) == 0
+    assert np.isnan(poses[12].step.covariance).all()
+    assert len(recorder.pairs) == 7 + 7, "no pair across the change"
+    assert recorder.resets == 2
+
+
+@pytest.mark.parametrize(
+    ("other", "says"),
+    [
+        (Scan(np.full(181, 5.0), ANGLES + np.pi / 2), "its beams lie from 0 to 180 degrees, one every 1"),
+        (Scan(np.full(91, 5.0), ANGLES[:91]), "its beams lie from -90 to 0 degrees"),
+        (Scan(np.full(181, 5.0), np.rad2deg(ANGLES)), "more than a circle"),
+        (Scan(np.linspace(100, 900, 181), ANGLES), "which cannot be metres"),
+        (Scan(np.full(30, 5.0), ANGLES[::6][:30]), "one every 6"),
+    ],
+)
+def test_a_scan_of_another_laser_is_not_used(recorder, other, says):
+    odometer = Odometer(recorder)
+    drive(odometer, random_scans(5))
+    poses = [odometer.step(replace(other, stamp=0.5 + 0.1 * n)) for n in range(PATIENCE + 3)]
+    for pose in poses:
+        assert pose.degraded.startswith("other laser: ")
+        assert says in pose.degraded
+        assert length(pose) == pytest.approx(0.5), "the last motion goes on"
+        assert len(odometer.returns()) == 0
+    assert odometer.beam_check.in_a_row == len(poses)
+    assert odometer.beam_check.is_for_good
+    assert len(recorder.pairs) == 4
 
 
 def test_a_bursty_clock_is_no_gap(recorder):
@@ -285,9 +381,9 @@ def test_scans_without_stamps_among_others_count_once(recorder, unstamped):
 def test_wild_stamps_and_angles_do_not_raise(recorder):
     odometer, scans = Odometer(recorder), random_scans(8)
     drive(odometer, scans[:5])
-    assert "gap" in odometer.step(scans[5], 1e308, ANGLES).degraded
+    assert odometer.step(scans[5], 1e308, ANGLES).degraded.startswith("clock set: from 0.4 to 1e+308 s")
     odometer.reset()
-    assert "no returns" in odometer.step(scans[6], 0.0, np.full(181, 1e307)).degraded
+    assert "not finite, or wild" in odometer.step(scans[6], 0.0, np.full(181, 1e307)).degraded
 
 
 def test_one_scan_without_a_stamp_does_not_forget_the_others(recorder):

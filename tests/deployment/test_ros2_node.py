@@ -97,9 +97,17 @@ def test_the_node_on_stand_ins(example, tmp_path, monkeypatch):
     example.main()
     scans, odometer = random_scans(4), Odometer.from_onnx(tmp_path / "tiny.onnx")
     handlers[0](scan_message([], 98.0))  # an empty scan says nothing of the laser
-    assert (published.pop().pose.pose.position.x, warnings.pop()) == (0.0, "no returns: none since the start")
-    with pytest.raises(InputError, match="but the model is for 180"):
-        handlers[0](scan_message(scans[0][:90], 99.0))
+    assert (published.pop().pose.pose.position.x, warnings.pop()) == (0.0, "no returns: none yet")
+    for number in range(4):
+        handlers[0](scan_message(scans[0][:90], 99.0 + 0.1 * number))
+        assert "other laser: its beams lie from -90 to -1 degrees" in warnings.pop()
+    with pytest.raises(InputError, match=r"its beams lie .*; train a model for such a laser"):
+        handlers[0](scan_message(scans[0][:90], 99.4))
+    broken = scan_message(scans[0], 99.5)
+    broken.angle_min = float("nan")
+    handlers[0](broken)
+    assert warnings.pop() == "no scan: its angle_min is nan"
+    published.clear()
     for number, scan in enumerate([*scans, np.zeros(181), np.zeros(181)]):
         handlers[0](scan_message(scan, 100.0 + 0.1 * number))
     handlers[0](scan_message(scans[0], 100.2))

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -14,7 +15,7 @@ import numpy as np
 import pytest
 import torch
 
-from conftest import ROOT
+from conftest import ROOT, SHARED
 from data.make_bag import FORMATS, make_bag
 from data.make_carmen import make_carmen
 from data.make_kitti import TR, make_kitti
@@ -127,7 +128,7 @@ def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
     assert main(["run", model, bag, "--out", str(out)]) == 1
     assert "choose one with --topic: /a, /b" in capsys.readouterr().err
     assert main(["run", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
-    assert "the model is for 360 degrees with one every 0.5" in capsys.readouterr().err
+    assert "the sensor's all round, one every 0.5; train a model for such a laser" in capsys.readouterr().err
     assert not out.exists()
     assert main(["run", model, bag, "--out", str(out), "--topic", "/a"]) == 0
 
@@ -277,6 +278,125 @@ def test_trouble_is_counted_by_kind(model, tmp_path):
     # A late scan has a line of its own, but no place in time.
     assert len(read_kitti(tmp_path / "out" / "trajectory.txt")) == 10
     assert np.all(np.diff(read_tum(tmp_path / "out" / "trajectory.tum")[0]) > 0)
+
+
+def start_of(stream, model, out):
+    """A run that is refused: the reason; how many poses were written."""
+    with pytest.raises(InputError) as refused:
+        run(Odometer.from_onnx(model), stream, "tiny", out)
+    assert ";" in str(refused.value)
+    return str(refused.value), len(steps_in(out)) if (out / "steps.jsonl").exists() else 0
+
+
+def scans_of(*bearings_of_scans, distance=5.0):
+    """A stream of even walls, one scan for each of these bearings in degrees."""
+    rows = [
+        Scan(np.full(len(degrees), distance), np.deg2rad(degrees), stamp=0.1 * n)
+        for n, degrees in enumerate(bearings_of_scans)
+    ]
+    return ScanStream("robot.bag", iter(rows))
+
+
+FULL, HALF_OF_IT = np.arange(-90.0, 91.0), np.arange(-90.0, 1.0)
+
+
+def test_a_laser_that_starts_slowly_is_judged_by_several_scans(model, tmp_path):
+    stream = scans_of([], [], HALF_OF_IT, HALF_OF_IT, *[FULL] * 10, HALF_OF_IT, *[FULL] * 5)
+    summary = run(Odometer.from_onnx(model), stream, "tiny", tmp_path / "out")
+    assert summary["scans"] == len(steps_in(tmp_path / "out")) == 20
+    assert summary["degraded"] == {"no returns": 2, "other laser": 3, "gap": 1}
+
+
+def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_path):
+    message, written = start_of(scans_of(*[np.arange(0.0, 180.0)] * 40), model, tmp_path / "out")
+    assert message == (
+        "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
+        "degrees, one every 1; train a model for such a laser (python train.py "
+        "data.sensor.field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=90.0 ...), "
+        "or give another recording"
+    )
+    assert written == 0
+    assert not (tmp_path / "out").exists()
+    message, _ = start_of(scans_of(*[np.arange(0.0, 180.0)] * 3), model, tmp_path / "out")
+    assert "its beams lie from 0 to 179 degrees" in message, "a recording of three scans"
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_laser_that_becomes_another_one_keeps_what_came_before(model, tmp_path):
+    message, written = start_of(scans_of(*[FULL] * 10, *[HALF_OF_IT] * 20), model, tmp_path / "out")
+    assert "scan 15: its beams lie from -90 to 0 degrees" in message
+    assert written == 14
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["degraded"] == {"other laser": 4}
+    assert "scan 15" in summary["stopped"]
+
+
+@pytest.mark.parametrize(
+    ("ranges", "says"),
+    [
+        (np.zeros(181), "3620 are 0, negative, nan, or below their laser's minimum"),
+        (np.full(181, np.nan), "3620 are 0, negative, nan"),
+        (np.full(181, np.inf), "3620 are infinite, or at their laser's maximum or beyond it"),
+        (np.full(181, 81.91), "3620 are at the sensor's 40 m or beyond it"),
+        (np.where(np.arange(181) < 81, 0.0, np.inf), "2000 are infinite, .*, 1620 are 0"),
+    ],
+)
+def test_a_run_without_one_usable_scan_says_why(model, tmp_path, ranges, says):
+    rows = [Scan(ranges, np.deg2rad(FULL), stamp=0.1 * n) for n in range(20)]
+    message, written = start_of(ScanStream("robot.bag", iter(rows)), model, tmp_path / "out")
+    assert re.search(rf"robot.bag: none of its 20 scans has a return: of their readings {says}", message)
+    assert written == 0
+    assert not (tmp_path / "out").exists()
+
+
+def test_poses_do_not_wait_forever_for_a_usable_scan(model, tmp_path, monkeypatch):
+    monkeypatch.setattr("rcnn_odom.deployment.run.LONGEST_WAIT", 10)
+    rows = (Scan(np.zeros(181), np.deg2rad(FULL)) for _ in range(30))
+    _, written = start_of(ScanStream("robot.bag", rows), model, tmp_path / "out")
+    assert written == 30
+
+
+def case(name):
+    """A recording of ``../shared/cases``."""
+    path = SHARED / "cases" / name
+    if not path.exists():
+        pytest.skip(f"no such case at {path}")
+    return path
+
+
+@pytest.fixture(scope="module")
+def fine(tmp_path_factory):
+    """A tiny network for a laser that turns all round, a beam every 0.2 degrees."""
+    path = tmp_path_factory.mktemp("model") / "fine.onnx"
+    write(to_onnx(build(sensor=Sensor(0.2, 360.0, 80.0)), "fp32"), path)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("name", "scans", "degraded"),
+    [
+        ("slow_start.bag", 40, {"no returns": 2, "other laser": 1}),
+        ("range_max_0.bag", 40, {}),
+        ("foreign_topic.bag", 10, {}),
+    ],
+)
+def test_cases_that_are_read(fine, tmp_path, name, scans, degraded):
+    assert main(["run", fine, str(case(name)), "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["scans"], summary["degraded"]) == (scans, degraded)
+    assert summary["path_m"] > 0
+
+
+def test_a_laser_that_sees_the_left_half_is_refused_or_read_whole(model, tmp_path, capsys):
+    path = case("left_half.bag")
+    assert main(["run", model, str(path), "--out", str(tmp_path / "out")]) == 1
+    assert "its beams lie from 0 to 179 degrees" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+    write(to_onnx(build(sensor=Sensor(1.0, 180.0, 80.0, facing_deg=90.0)), "fp32"), tmp_path / "left.onnx")
+    assert main(["run", str(tmp_path / "left.onnx"), str(path), "--out", str(tmp_path / "out")]) == 0
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["scans"] == 120
+    assert not {"other laser", "few returns"} & summary["degraded"].keys()
 
 
 @pytest.mark.slow

@@ -40,7 +40,10 @@ def stream(path, ring=None):
 
 def test_own_formats_and_an_added_one():
     formats = all_formats()
-    assert set(formats) == {"kitti", "carmen", "rosbag", "simulated", "stub_drives"}
+    assert set(formats) == {
+        *("kitti", "kitti_raw", "carmen", "rosbag", "json_lines", "simulated"),
+        "stub_drives",
+    }
     assert (find_format("kitti"), find_format("stub_drives")) == (kitti, stub_drives)
 
 
@@ -54,7 +57,10 @@ def test_a_recording_by_its_format_and_options(tmp_path):
 @pytest.mark.parametrize(
     ("reader", "says"),
     [
-        ({"format": "cartographer"}, "no recording format is called cartographer; there are carmen, kitti, "),
+        (
+            {"format": "cartographer"},
+            "no recording format is called cartographer; there are carmen, json_lines, ",
+        ),
         ({"format": None}, "no recording format is called None"),
         ({}, "no recording format is called None"),
         ({"format": "rosbag"}, "rosbag has no load"),
@@ -71,10 +77,12 @@ def test_mistakes_are_one_line(reader, says):
     assert "\n" not in str(raised.value)
 
 
-def test_an_added_format_is_asked_first_and_given_its_options(tmp_path, add):
+def test_an_added_format_is_asked_first_and_given_its_options(tmp_path, add, caplog):
     make_carmen(tmp_path, "robot", frames=4)
     options = {"topic": "/scan", "ring": 2, "field_of_view_deg": None}
     assert open_stream(tmp_path / "robot.log", options).name == "robot.log"
+    for option in ("topic", "ring"):
+        assert f"robot.log: read as carmen, which has no option {option}; it is left out" in caplog.text
     add(STREAMS)
     assert open_stream(tmp_path / "robot.log", options).name == "toy 2"
     assert open_stream(tmp_path / "robot.log").name == "toy None"

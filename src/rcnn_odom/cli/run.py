@@ -4,14 +4,19 @@ import argparse
 import io
 import json
 import logging
+import shlex
 import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from rcnn_odom.cli.arguments import Subcommands, whole_number
+from rcnn_odom.cli.arguments import Subcommands, degrees, height, whole_number
 
 if TYPE_CHECKING:
     from rcnn_odom.deployment.odometer import Odometer, Pose
+
+
+FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg")
+"""Options that are a format's own."""
 
 
 def add(commands: Subcommands) -> None:
@@ -19,8 +24,9 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "run",
         help="poses from a recording or a live laser",
-        description="Estimate the trajectory of a recording: a KITTI sequence folder, a CARMEN log, or a ROS "
-        "bag with LaserScan messages (ROS 1, ROS 2 sqlite3 or mcap; no ROS needed). Writes trajectory.txt "
+        description="Estimate the trajectory of a recording: a folder of a KITTI sequence or of a KITTI raw "
+        "drive, a CARMEN log, a ROS bag with LaserScan or PointCloud2 messages (ROS 1, ROS 2 sqlite3 or "
+        "mcap; no ROS needed), or a file of JSON lines; packed ones too. Writes trajectory.txt "
         "(KITTI), trajectory.tum, steps.jsonl (each step with its uncertainty), map.png and summary.json. "
         "With --live: scans as JSON lines from standard input, such as "
         '{"stamp": 1.0, "ranges": [2.5, ...], "angle_min": -3.14, "angle_increment": 0.0031}, and a pose '
@@ -36,14 +42,14 @@ def add(commands: Subcommands) -> None:
     add("--model", metavar="MODEL", help="an exported .onnx, a .ckpt, or rcnn_small, which ships along")
     add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
     add("--out", type=Path, metavar="DIR", help="folder to write to; must not hold a trajectory yet")
-    add("--topic", help="of the LaserScan messages in a bag that has several")
-    add("--ring", type=whole_number(0), metavar="N", help="of a KITTI sequence (the most level one)")
+    add("--topic", help="of the LaserScan or PointCloud2 messages in a bag that has several")
+    add("--ring", type=whole_number(0), metavar="N", help="of KITTI or a point cloud (the most level one)")
+    add("--height", type=height, metavar="LOW:HIGH", help="metres: cuts a slice of a point cloud, not a ring")
     add(
         "--field-of-view-deg",
-        type=float,
-        default=180.0,
+        type=degrees,
         metavar="DEG",
-        help="that the beams of a CARMEN log's FLASER lines cover (%(default)g)",
+        help="that the beams of a CARMEN log's FLASER lines cover (what the log says, or 180)",
     )
     add("--threads", type=whole_number(1), default=1, metavar="N", help="of the computation (%(default)s)")
     parser.set_defaults(run=lambda arguments: _run(parser, arguments))
@@ -65,15 +71,15 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     if arguments.live:
         if isinstance(sys.stdin, io.TextIOWrapper):
             sys.stdin.reconfigure(errors="replace")  # bytes that are no text are a line that is no scan
-        summary = run(odometer, json_lines.stream(sys.stdin), model, arguments.out, _print_pose)
+        summary = run(odometer, json_lines.stream_lines(sys.stdin), model, arguments.out, _print_pose)
         print(format_summary(summary), file=sys.stderr)
         return 0
-    options = {name: getattr(arguments, name) for name in ("topic", "ring", "field_of_view_deg")}
+    options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
     stream = open_stream(Path(paths[1]), options)
     for note in stream.notes:
         print(f"{stream.name}: {note}")
     print(format_summary(run(odometer, stream, model, arguments.out)))
-    print(f"all of it is in {arguments.out}")
+    print(f"all of it is in {shlex.quote(str(arguments.out))}")
     return 0
 
 

@@ -1,7 +1,6 @@
 """Streaming odometry: one scan in, one pose out, in constant memory."""
 
 import math
-from collections import deque
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -9,29 +8,23 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
+from rcnn_odom.deployment.clock import LATE, Clock
 from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.deployment.shipped import find_file
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, Step, advance, planar_to_poses
 from rcnn_odom.models.contract import Stepper
 from rcnn_odom.models.encoding import Sensor, decode
+from rcnn_odom.recordings.beams import PATIENCE, BeamCheck
 from rcnn_odom.recordings.scan import Scan
 
 LONGEST_HOLD = 10
 """Periods over which the last motion goes on; for longer it is not known to."""
-REMEMBERED = 15
-"""Intervals that tell the usual period."""
-FOLLOWING = 0.2
-"""Part of a stamp's jitter that the expected time of the next scan follows."""
-FOREVER = 1e9
-"""Periods that no longer differ; a wild stamp is farther away than an integer can tell."""
-SLOW = 1.5
-"""Times the period of training from which on steps are longer than a network knows."""
 SAME_SPACING = 0.2
 """Part by which the spacing of a laser's returns may differ between scans."""
-LATE = "late scan"
-LATE_IN_A_ROW = 5
-"""After so many late scans it is the clock that has been set."""
+OTHER_FRAME, OTHER_LASER = "other frame", "other laser"
+PASSED_OVER = (LATE, OTHER_FRAME)
+"""Kinds of trouble whose scans leave the pose as it was."""
 
 
 def _no_step() -> Step:
@@ -92,7 +85,15 @@ class Odometer:
       ``LONGEST_HOLD`` periods at most. Networks do not know such long steps; comparing the scans at both
       ends all the same is several times worse (docs/deployment.md).
     - *late scan*, a stamp not after the one before: passed over, and the pose is the last one again.
-      After ``LATE_IN_A_ROW`` of them the clock is taken as set, and it goes on as after a gap.
+      After five of them in a row the clock is taken as set, and it goes on as after a gap; if they were
+      all equal, the clock stands still and every scan counts as the next one.
+    - *clock set*, a stamp more than ten seconds before or after the last one: nobody knows how much time has
+      passed, so no motion is added, the step's covariance is unknown, and the new stamps are the clock from
+      there on. A stamp of 0 among others, or always, is none.
+    - *other frame*, a scan of another ``frame_id`` than the scans before: passed over as of another laser.
+      After five of them in a row it is the laser's (*new frame*), and no motion is added to there.
+    - *other laser*, beams that do not lie where the sensor has them, or readings that cannot be metres (see
+      :mod:`rcnn_odom.recordings.beams`): not used, the last motion goes on.
     - *slow scans*: more than 1.5 times the period of training between them; the estimate stands.
     - *fast scans*: less than the period of training over 1.5; the estimate stands, but gaps are counted in
       periods of training, so that short ones are not noticed and over long ones too little is held.
@@ -148,12 +149,14 @@ class Odometer:
         self._present: npt.NDArray[np.float32] | None = None  # the scan that was taken at the last pose
         self._position, self._motion, self._last_pose = np.zeros(3), np.zeros(3), Pose()
         self._missed, self._held, self._beams, self._spacing = 0, 0, 0, 0.0
-        self._forget_clock()
+        self._frame, self._of_other_frame, self._begun = "", 0, False
+        self.beam_check = BeamCheck(self.description.sensor)
+        self._clock = Clock(self.description.period)
 
-    def _forget_clock(self) -> None:
-        self._stamp: float | None = None
-        self._expected, self._late, self._unstamped = 0.0, 0, 0
-        self._intervals: deque[float] = deque(maxlen=REMEMBERED)
+    @property
+    def has_seen(self) -> bool:
+        """Whether there is a scan with returns that the next one can be compared with."""
+        return self._earlier is not None
 
     def step(
         self, scan: Scan | npt.ArrayLike, stamp: float | None = None, angles: npt.ArrayLike | None = None
@@ -179,30 +182,32 @@ class Odometer:
         if not isinstance(scan, Scan):
             scan = _as_scan(scan, stamp, angles)
         stamp = None if scan.stamp is None or not math.isfinite(scan.stamp) else float(scan.stamp)
-        lost, self._present = 0, None
-        if stamp is not None and self._stamp is not None and stamp <= self._stamp:
-            self._late += 1
-            if self._late < LATE_IN_A_ROW:
-                late = f"{LATE}: stamp {stamp:.6f} is not after {self._stamp:.6f}, passed over"
-                return replace(self._last_pose, step=_no_step(), degraded=late)
-            lost = self._late - 1
-            self._forget_clock()
-        depth, notes = self._encode(scan)
-        periods = lost + self._count_periods(stamp, notes)
-        if self._earlier is None:
-            return self._begin(depth, stamp, notes)
+        self._present = None
+        frame = scan.frame_id.lstrip("/")
+        if frame and self._frame and frame != self._frame:
+            self._of_other_frame += 1
+            if self._of_other_frame < PATIENCE:
+                return self._pass_over(f"{OTHER_FRAME}: {frame} after {self._frame}, passed over")
+        tick = self._clock.read(stamp)
+        if tick.late:
+            return self._pass_over(tick.late)
+        notes = self._follow_frame(frame)
+        depth = self._encode(scan, notes)
+        notes += tick.notes
+        if self._earlier is None or tick.clock_set:
+            return self._begin(depth, stamp, [*([tick.clock_set] if tick.clock_set else []), *notes])
         if not depth.any():
-            self._missed += periods
-            return self._hold(stamp, periods, ["no returns: the last motion goes on"])
-        earlier, gap = self._earlier, periods + self._missed
+            self._missed += tick.periods
+            return self._hold(stamp, tick.periods, notes)
+        earlier, gap = self._earlier, tick.periods + self._missed
         self._earlier, self._missed = depth, 0
         if gap > 1:
             notes.append(f"gap: {gap} periods after the last scan, the last motion goes on")
-            return self._hold(stamp, periods, notes)
+            return self._hold(stamp, tick.periods, notes)
         step = self._stepper(np.stack([earlier, depth]))
         if not np.isfinite(step.array()).all():
             self._stepper.reset()  # its state is nan as well
-            return self._hold(stamp, periods, [*notes, "no estimate: the last motion goes on"])
+            return self._hold(stamp, tick.periods, [*notes, "no estimate: the last motion goes on"])
         self._motion, self._held = step.array(), 0
         return self._move(stamp, step, notes)
 
@@ -217,14 +222,37 @@ class Odometer:
         points = decode(self._present, self.description.sensor)
         return (points @ pose[:2, :2].T + pose[:2, 3]).astype(np.float32)
 
-    def _encode(self, scan: Scan) -> tuple[npt.NDArray[np.float32], list[str]]:
-        """A depth vector (bins,), and what is unusual about it."""
-        depth = self._present = self.description.sensor.encode(scan)
-        notes = self._compare_beams(scan)
+    def _pass_over(self, why: str) -> Pose:
+        """The last pose again, for a scan that is not used."""
+        return replace(self._last_pose, step=_no_step(), degraded=why)
+
+    def _follow_frame(self, frame: str) -> list[str]:
+        """Takes a scan's frame for the laser's; words about it where the laser had another one."""
+        before, self._frame, self._of_other_frame = self._frame, frame or self._frame, 0
+        if before == self._frame or not before:
+            return []
+        # Another laser, or another place of it: nothing of before can be compared with its scans.
+        self._stepper.reset()
+        self._earlier, self._missed, self._motion = None, 0, np.zeros(3)
+        self.beam_check = BeamCheck(self.description.sensor)
+        return [f"new frame: {frame} after {before}, no motion is added"]
+
+    def _encode(self, scan: Scan, notes: list[str]) -> npt.NDArray[np.float32]:
+        """A depth vector (bins,), empty where the scan does not fit; adds what is unusual to ``notes``."""
+        sensor = self.description.sensor
+        if misfit := self.beam_check(scan):
+            notes.append(f"{OTHER_LASER}: {misfit}")
+            self._present = np.zeros(sensor.bins, np.float32)
+            return self._present
+        depth = self._present = sensor.encode(scan)
+        if not depth.any():
+            notes.append("no returns: the last motion goes on" if self.has_seen else "no returns: none yet")
+            return depth
+        notes += self._compare_beams(scan)
         filled = np.count_nonzero(depth) / len(depth)
         if filled < self.description.least_filled:
             notes.append(f"few returns: {filled:.1%} of the bins have one")
-        return depth, notes
+        return depth
 
     def _compare_beams(self, scan: Scan) -> list[str]:
         """Words about another number of beams than before, if there is one.
@@ -240,44 +268,12 @@ class Odometer:
         same = not before or abs(spacing - last) < SAME_SPACING * last
         return [] if same else [f"beam count: {count} after {before}"]
 
-    def _count_periods(self, stamp: float | None, notes: list[str]) -> int:
-        """How many usual periods after the last stamp this one comes, 1 or more; without stamps 1.
-
-        Measured from where the last scan was expected, which follows a jittering or bursty clock slowly.
-        """
-        if stamp is None:
-            self._unstamped += 1
-            return 1
-        before, self._stamp, self._late = self._stamp, stamp, 0
-        scans, self._unstamped = 1 + self._unstamped, 0
-        if before is None:
-            self._expected = stamp
-            return 1
-        trained = self.description.period
-        # The median does without single gaps, the mean without bursts.
-        middles = [np.median(self._intervals), np.mean(self._intervals)] if len(self._intervals) >= 3 else []
-        recent = float(min(middles, default=math.nan))
-        usual = float(np.fmax(recent, trained))
-        self._intervals.append((stamp - before) / scans)
-        if math.isnan(usual):
-            self._expected = stamp
-            return 1
-        if recent > SLOW * trained:
-            notes.append(f"slow scans: one every {recent:.3g} s, in training every {trained:.3g} s")
-        elif max(middles, default=math.inf) * SLOW < trained:
-            notes.append(f"fast scans: one every {recent:.3g} s, in training every {trained:.3g} s")
-        late = stamp - self._expected - scans * usual
-        lost = max(0, round(min(late / usual, FOREVER)))
-        self._expected = stamp - (1 - FOLLOWING) * (late - lost * usual)
-        return 1 + lost
-
     def _begin(self, depth: npt.NDArray[np.float32], stamp: float | None, notes: list[str]) -> Pose:
-        """The pose of the first scan that has returns, and of those before it: the origin."""
-        if depth.any():
-            self._earlier = depth
-        else:
-            notes = ["no returns: none since the start"]
-        return self._move(stamp, _no_step(), notes)
+        """A pose without motion: at the start, which is certain, or where nobody knows how far it went."""
+        step = Step(0.0, 0.0, 0.0) if self._begun else _no_step()
+        self._earlier, self._missed = (depth if depth.any() else None), 0
+        self._begun = self._begun or self.has_seen
+        return self._move(stamp, step, notes)
 
     def _hold(self, stamp: float | None, periods: int, notes: list[str]) -> Pose:
         """A pose where the last motion goes on, over ``LONGEST_HOLD`` periods in all at most."""

@@ -14,11 +14,12 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from rcnn_odom.deployment.odometer import LATE, Odometer, Pose
+from rcnn_odom.deployment.odometer import PASSED_OVER, Odometer, Pose
 from rcnn_odom.deployment.sampling import EvenSample
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import change_frame
-from rcnn_odom.recordings.formats import need_fitting_scan
+from rcnn_odom.recordings.beams import compare_beams
+from rcnn_odom.recordings.returns import AbsentReturns
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import write_kitti, write_tum
@@ -28,6 +29,9 @@ MAP, SUMMARY = "map.png", "summary.json"
 MAP_SCANS = 2000
 """Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
 LATENCIES = 100_000
+LONGEST_WAIT = 1000
+"""Poses that wait for the first scan that can be used, before they are written all the same."""
+ANOTHER_MODEL = "train a model for such a laser (python train.py {} ...), or give another recording"
 
 Summary = dict[str, Any]
 
@@ -42,7 +46,7 @@ def run(
     """Poses for all scans of a stream.
 
     What is written is valid at every moment, and complete up to the scan where a stream breaks off or
-    the run is stopped.
+    the run is stopped. Nothing is written before there is a scan that can be used.
 
     Args:
         odometer: at its start.
@@ -56,21 +60,20 @@ def run(
 
     Raises:
         InputError: the folder holds a trajectory or cannot be written, the laser is another than the
-            model's, the stream has no scan or breaks off.
+            model's, the stream has no scan, none that can be used, or breaks off.
     """
-    statistics = Statistics(stream, model)
+    statistics = Statistics(stream, model, odometer)
     with ExitStack() as stack:
         folder = OutputFolder(out, stream, stack) if out else None
         bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
         try:
             for scan in stack.enter_context(closing(bar)):
-                pose = statistics.step(odometer, scan)
+                pose = statistics.step(scan)
                 if folder:
-                    folder.add(pose)
+                    folder.add(pose, statistics.can_use)
                 if on_pose:
                     on_pose(pose)
-            if not statistics.scans:
-                raise InputError(f"{stream.name}: no scan in it")
+            statistics.need_a_use()
         except BaseException as error:
             statistics.stopped = str(error) or type(error).__name__
             raise
@@ -86,29 +89,43 @@ class Statistics:
     Args:
         stream: the scans.
         model: what to call the network.
+        odometer: at its start.
+
+    Attributes:
+        can_use: there was a scan that fits the model and has returns.
+
+    Raises:
+        InputError: the stream's laser is another than the model's.
     """
 
-    def __init__(self, stream: ScanStream, model: str) -> None:
-        self.stream, self.model = stream, model
+    def __init__(self, stream: ScanStream, model: str, odometer: Odometer) -> None:
+        self.stream, self.model, self.odometer = stream, model, odometer
         self.scans, self.path, self.longest, self.stopped = 0, 0.0, 0.0, ""
-        self._fits = False
+        self.can_use, sensor = False, odometer.description.sensor
+        self._absent = AbsentReturns(sensor.max_range)
+        if stream.beams and (reason := compare_beams(stream.beams, sensor)):
+            advice = ANOTHER_MODEL.format(stream.beams.sensor_options())
+            raise InputError(f"{stream.name}: {reason}; {advice}")
         self.degraded: Counter[str] = Counter()
         self.milliseconds = EvenSample[float](LATENCIES)
         self.sample = EvenSample[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
 
-    def step(self, odometer: Odometer, scan: Scan) -> Pose:
+    def step(self, scan: Scan) -> Pose:
         """One scan through the odometer, timed and counted.
 
         Raises:
-            InputError: the first scan that has a range is of another laser than the model's.
+            InputError: the laser is another than the model's, for good.
         """
-        if not self._fits and (scan.ranges > 0).any():
-            need_fitting_scan(self.stream, scan, odometer.description.sensor)
-            self._fits = True
+        odometer = self.odometer
         start = time.perf_counter()
         pose = odometer.step(scan if self.stream.has_clock else replace(scan, stamp=None))
         milliseconds = 1e3 * (time.perf_counter() - start)
         self.scans += 1
+        if odometer.beam_check.is_for_good:
+            raise odometer.beam_check.refusal(f"{self.stream.name}: scan {self.scans}", ANOTHER_MODEL)
+        self.can_use = self.can_use or odometer.has_seen
+        if not self.can_use:
+            self._absent.add(scan)
         self.path += math.hypot(pose.step.x, pose.step.y)
         self.longest = max(self.longest, milliseconds)
         self.milliseconds.add(lambda: milliseconds)
@@ -116,6 +133,20 @@ class Statistics:
         self.sample.add(lambda: (pose, odometer.returns()))
         # A scan that was passed over keeps the stamp of the pose that it repeats.
         return pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
+
+    def need_a_use(self) -> None:
+        """Looks at the end whether anything could be used.
+
+        Raises:
+            InputError: nothing could; the message says why.
+        """
+        if self.can_use:
+            return
+        if self.odometer.beam_check.reason:
+            raise self.odometer.beam_check.refusal(self.stream.name, ANOTHER_MODEL)
+        if not self.scans:
+            raise InputError(f"{self.stream.name}: no scan in it; give another recording")
+        raise InputError(f"{self.stream.name}: {self._absent}; give another recording, or mend its laser")
 
     def summary(self) -> Summary:
         """Plain values."""
@@ -147,6 +178,7 @@ class OutputFolder:
     def __init__(self, folder: Path, stream: ScanStream, stack: ExitStack) -> None:
         self.folder, self.stream = folder, stream
         self._stack, self._written = stack, 0
+        self._waiting: list[Pose] = []
         if (folder / TRAJECTORY).exists():
             raise InputError(f"{folder}: holds a trajectory already; choose another --out")
 
@@ -155,7 +187,7 @@ class OutputFolder:
             self.folder.mkdir(parents=True, exist_ok=True)
             # Line by line, so that a run that is killed leaves no half of one.
             self._kitti, self._tum, self._steps = (
-                self._stack.enter_context((self.folder / name).open("w", buffering=1))
+                self._stack.enter_context((self.folder / name).open("w", buffering=1, encoding="utf-8"))
                 for name in (TRAJECTORY, TUM, STEPS)
             )
         except OSError as error:
@@ -163,17 +195,26 @@ class OutputFolder:
                 f"{self.folder}: cannot be written ({error.strerror}); choose another --out"
             ) from error
 
-    def add(self, pose: Pose) -> None:
-        """One more pose; without a stamp it is written under its number, a late one under no time.
+    def add(self, pose: Pose, can_use: bool) -> None:
+        """One more pose, which waits for the first scan that can be used.
 
         Raises:
             InputError: the folder cannot be written.
         """
+        self._waiting.append(pose)
+        if not can_use and not self._written and len(self._waiting) < LONGEST_WAIT:
+            return
         if not self._written:
             self._begin()
+        for pose in self._waiting:
+            self._write(pose)
+        self._waiting = []
+
+    def _write(self, pose: Pose) -> None:
+        """A line each; without a stamp a pose stands under its number, and one told again under no time."""
         camera_pose = change_frame(pose.matrix()[None], self.stream.camera_from_laser)
         write_kitti(self._kitti, camera_pose)
-        if not pose.degraded.startswith(LATE):
+        if not pose.degraded.startswith(PASSED_OVER):
             write_tum(self._tum, [self._written if pose.stamp is None else pose.stamp], camera_pose)
         self._steps.write(json.dumps(pose.as_dict()) + "\n")
         self._written += 1
@@ -184,7 +225,9 @@ class OutputFolder:
             return
         from rcnn_odom.evaluation.figures import map_figure
 
-        (self.folder / SUMMARY).write_text(json.dumps(statistics.summary(), indent=2) + "\n")
+        (self.folder / SUMMARY).write_text(
+            json.dumps(statistics.summary(), indent=2) + "\n", encoding="utf-8"
+        )
         poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in statistics.sample.items])
         points = [points for _, points in statistics.sample.items]
         title = f"{self.stream.name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"

@@ -4,21 +4,21 @@ A format is a module. ``load(name, **options) -> Recording`` makes it one to tra
 bool`` and ``stream(path, **options) -> ScanStream`` make it one to stream.
 """
 
+import logging
 from collections.abc import Mapping
 from functools import partial
 from inspect import signature
 from itertools import chain
 from pathlib import Path
 from types import ModuleType
-from typing import Any, Protocol
-
-import numpy as np
+from typing import Any
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.recording import OpenRecording
-from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.registry import choose, collect, modules_in
+
+log = logging.getLogger(__name__)
 
 WHAT, PACKAGE = "recording format", "rcnn_odom.recordings"
 ASKED_LAST = ("carmen", "simulated")
@@ -90,8 +90,9 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
 
     Args:
         path: of it.
-        options: ``topic`` of a bag's LaserScan, ``ring`` of a KITTI sequence, ``field_of_view_deg`` of a
-            CARMEN log's FLASER lines; each format takes its own, and None is left out.
+        options: ``topic`` of a bag, ``ring`` of a KITTI drive or of a point cloud, ``height`` of a point
+            cloud, ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left out; one that the
+            format does not have is told and left out.
 
     Raises:
         InputError: nothing of the kind, or it cannot be read.
@@ -100,55 +101,19 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
         raise InputError(f"{path}: no such file or folder; give a KITTI sequence, a CARMEN log or a ROS bag")
     for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, ASKED_LAST)):
         if hasattr(found, "recognises") and found.recognises(path):
-            taken = signature(found.stream).parameters
-            given = {name: value for name, value in (options or {}).items() if value is not None}
-            stream: ScanStream = found.stream(path, **{name: given[name] for name in given if name in taken})
+            stream: ScanStream = found.stream(path, **_options_for(found, path, options or {}))
             return stream
     raise InputError(
-        f"{path}: neither a KITTI sequence (no velodyne/ in it; name sequences/05) nor a ROS 2 bag (no "
-        "metadata.yaml)"
+        f"{path}: neither a KITTI sequence (no velodyne/ or velodyne_points/ in it; name sequences/05) nor a "
+        "ROS 2 bag (no metadata.yaml, .db3 or .mcap in it); give one of them"
     )
 
 
-class Spacing(Protocol):
-    """The laser for which a network was trained."""
-
-    @property
-    def field_of_view_deg(self) -> float:
-        """Degrees that it covers."""
-
-    @property
-    def resolution_deg(self) -> float:
-        """Degrees between the bins."""
-
-
-def need_fitting_scan(stream: ScanStream, scan: Scan, sensor: Spacing) -> None:
-    """Compares the beams of a scan with what a network was trained for; returns alone do not tell of them.
-
-    Raises:
-        InputError: they cover another part of the circle, or are too far apart or too close for its bins.
-    """
-    beams = stream.beams
-    if beams is None and scan.has_all_beams:
-        beams = _beams_of(scan, sensor)
-    if beams is None:
-        return
-    covered, spacing = beams
-    fits = abs(covered - sensor.field_of_view_deg) <= 0.1 * sensor.field_of_view_deg
-    # From a third of a bin on, as 0.5 degrees for 1, to two bins, as a Velodyne's 0.18 for 0.1.
-    if not (fits and 0.3 * sensor.resolution_deg < spacing < 2.05 * sensor.resolution_deg):
-        raise InputError(
-            f"{stream.name}: a laser of {covered:.0f} degrees, a beam every {spacing:.2g}, but the model is "
-            f"for {sensor.field_of_view_deg:g} degrees with one every {sensor.resolution_deg:g}; train one "
-            "for such a laser (python train.py data.sensor.field_of_view_deg=... "
-            "data.sensor.resolution_deg=...)"
-        )
-
-
-def _beams_of(scan: Scan, sensor: Spacing) -> tuple[float, float]:
-    """Degrees that the beams cover, and degrees between them; without bearings they cover the sensor's."""
-    count = len(scan.ranges)
-    if scan.bearings is None:
-        return sensor.field_of_view_deg, sensor.field_of_view_deg / max(count - 1, 1)
-    spacing = float(np.rad2deg(np.median(np.abs(np.diff(scan.bearings))))) if count > 1 else 360.0
-    return spacing * count, spacing
+def _options_for(found: ModuleType, path: Path, options: Mapping[str, Any]) -> dict[str, Any]:
+    """Those of the options that a format's ``stream`` takes."""
+    given = {name: value for name, value in options.items() if value is not None}
+    taken = signature(found.stream).parameters
+    for name in given.keys() - taken.keys():
+        kind = found.__name__.rpartition(".")[2]
+        log.warning("%s: read as %s, which has no option %s; it is left out", path, kind, name)
+    return {name: value for name, value in given.items() if name in taken}
