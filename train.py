@@ -9,7 +9,7 @@ from omegaconf import DictConfig
 from rcnn_odom.training.job import in_sweep, run_command, run_job
 
 
-def train(cfg: DictConfig, *, reuse: bool = False) -> dict:
+def train(cfg: DictConfig, *, reuse: bool = False) -> dict | None:
     """Everything that one run does: see :func:`rcnn_odom.training.stages.train`."""
     # Here and not above: `--help` and a mistyped option should not wait for torch.
     from rcnn_odom.training import stages

@@ -32,7 +32,7 @@ class Scans:
         time.sleep(self.seconds)
         rng = np.random.default_rng([self.seed, crc32(self.name.encode()), frame])
         bearings = rng.uniform(-np.pi, np.pi, 100)
-        return Scan(rng.uniform(0, 50, 100), bearings)
+        return Scan(rng.uniform(0, 50, 100), bearings, has_all_beams=False)
 
 
 def load(name, seed=0, broken="", seconds=0.0, frames=None, **options):

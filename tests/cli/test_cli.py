@@ -3,12 +3,14 @@
 import json
 import os
 import runpy
+import shlex
 import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from hydra.core.override_parser.overrides_parser import OverridesParser
 
 import rcnn_odom
 from rcnn_odom.cli import main
@@ -391,3 +393,43 @@ def test_as_a_module_of_python(monkeypatch, capsys):
         runpy.run_module("rcnn_odom.cli", run_name="__main__")
     assert stopped.value.code == 0
     assert "drift" in capsys.readouterr().out
+
+
+def test_a_terminal_that_knows_ascii_alone(tmp_path):
+    write_kitti(tmp_path / "wahrheit_ü.txt", straight(150))
+    command = [sys.executable, "-m", "rcnn_odom.cli", "drift", "wahrheit_ü.txt", "fehlt_ü.txt"]
+    environment = {**os.environ, "PYTHONPATH": str(SOURCE), "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(command, capture_output=True, text=True, env=environment, cwd=tmp_path, check=False)
+    assert done.returncode == 1
+    assert done.stderr.startswith(r"rcnn-odom: error: fehlt_\xfc.txt: cannot be read")
+    assert done.stderr.count("\n") == 1
+
+
+def test_what_is_printed_to_be_copied_is_quoted(tmp_path, capsys):
+    folder = tmp_path / "mine (ü)"
+    assert main(["simulate", "--out", str(folder), "--frames", "2", "--sequence", "ä b"]) == 0
+    printed = capsys.readouterr().out.strip()
+    words = shlex.split(printed)
+    assert str(folder) in [word.rstrip(";") for word in words]
+    overrides = OverridesParser.create().parse_overrides(words[words.index("evaluate.py") + 1 :])
+    assert {override.key_or_group: override.value() for override in overrides[:3]} == {
+        "data": "kitti",
+        "data.root": str(folder),
+        "data.test": ["ä b"],
+    }
+
+
+@pytest.mark.parametrize("content", [b"", b"no network\n"])
+def test_what_is_no_checkpoint_gives_one_short_line(tmp_path, capsys, content):
+    path = tmp_path / "checkpoints" / "best.ckpt"
+    path.parent.mkdir()
+    path.write_bytes(content)
+    (tmp_path / "log").touch()
+    for arguments in (
+        ["export", str(path), "--no-drift"],
+        ["run", str(path), str(tmp_path / "log"), "--out", str(tmp_path / "out")],
+    ):
+        assert main(arguments) == 1
+        error = one_line_error(capsys)
+        assert "not a checkpoint; give RUN/checkpoints/best.ckpt of a run" in error
+        assert len(error) < len(str(path)) + 100

@@ -179,3 +179,26 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
     start(uneven, tmp_path / "whole", 3).communicate(timeout=200)
     one, other = (saved(tmp_path / name, BEST)["state_dict"] for name in ("stopped", "whole"))
     assert all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+@pytest.mark.slow
+def test_processes_whose_time_is_up_are_scored_and_go_on_bit_for_bit(configure, uneven, tmp_path):
+    options = ["model=cnn_cls", *uneven, "trainer=ddp", "model.batch_size=4", "model.epochs=1"]
+    metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
+    assert metrics["training"]["steps"] == 1
+    assert metrics["training"]["stopped_by"] == "trainer.max_time"
+    assert metrics["test"]["sequences"]["05"]["frames"] == 80
+    train(configure(*options))
+    train(configure(*options, run="whole"))
+    one, other = (
+        torch.load(tmp_path / "outputs" / run / BEST, weights_only=True)["state_dict"]
+        for run in ("run", "whole")
+    )
+    assert all(torch.equal(value, other[name]) for name, value in one.items())
+
+
+@pytest.mark.slow
+def test_fast_dev_run_in_two_processes(configure, uneven):
+    options = ["model=cnn_cls", *uneven, "trainer=ddp", "+trainer.sync_batchnorm=true"]
+    training = train(configure(*options, "+trainer.fast_dev_run=2"))["training"]
+    assert (training["epochs"], training["steps"]) == (1, 2)

@@ -57,9 +57,9 @@ def test_a_command_without_a_mistake_is_a_success():
 def hydra(monkeypatch, tmp_path):
     """A function that makes Hydra tell of a job: what it gives to ``run_job``."""
 
-    def hydra(number="???", overrides=(), **choices):
+    def hydra(number="???", overrides=(), chdir=None, **choices):
         told = {
-            "job": {"num": number},
+            "job": {"num": number, "chdir": chdir},
             "runtime": {"output_dir": str(tmp_path), "choices": choices},
             "overrides": {"task": list(overrides)},
         }
@@ -143,3 +143,11 @@ def test_a_signal_is_passed_on_once(monkeypatch):
 
     with pytest.raises(Stopped):
         train()
+
+
+def test_paths_are_relative_to_where_the_command_was_started(hydra, caplog):
+    assert job.run_job(lambda cfg: 5, hydra(chdir=True)) is None
+    assert (
+        "hydra.job.chdir=true: paths are relative to where the command was started; leave it out"
+        in caplog.text
+    )

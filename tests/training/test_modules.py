@@ -402,3 +402,23 @@ def test_missing_file_and_folder_are_refused(tmp_path):
         load_module(tmp_path / "absent.ckpt")
     with pytest.raises(InputError, match="not a checkpoint"):
         load_module(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "empty, not a checkpoint; give RUN/checkpoints/best.ckpt of a run"),
+        (b"this is text\n", "not a checkpoint; give RUN/checkpoints/best.ckpt of a run"),
+        (
+            stored(Evil("made")),
+            "not a checkpoint of this project, or of an older version (it holds more than numbers)",
+        ),
+    ],
+)
+def test_what_is_no_checkpoint_is_told_in_a_short_line(tmp_path, content, message):
+    path = tmp_path / "best.ckpt"
+    path.write_bytes(content)
+    with pytest.raises(InputError) as refused:
+        load_module(path)
+    assert str(refused.value).startswith(f"{path}: {message}")
+    assert len(str(refused.value)) < len(str(path)) + 120

@@ -132,7 +132,7 @@ def test_a_failed_job_does_not_end_the_sweep_but_its_status(sweep, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["+sweeps=nothing"], "Could not find 'sweeps/nothing'"),
+        (["+sweeps=nothing"], "sweeps=nothing: there is no such choice; there are beta"),
         (["model.kernel_size=3,5", "run_dir=here"], "run_dir= is one run's"),
     ],
 )

@@ -7,7 +7,9 @@ from collections.abc import Sequence
 
 from rcnn_odom import __version__
 from rcnn_odom.cli import drift, export, frames, relations, report, run, simulate
+from rcnn_odom.cli.arguments import join_heights
 from rcnn_odom.errors import InputError
+from rcnn_odom.training.terminal import show_any_text
 
 # Heavy imports stay inside the commands, so that --help answers at once.
 
@@ -22,7 +24,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         Exit status: 0, or 1 after one line on stderr about bad input, or 130 after Ctrl-C. Wrong usage
         exits with 2.
     """
-    arguments = _build_parser().parse_args(argv)
+    show_any_text()
+    arguments = _build_parser().parse_args(join_heights(sys.argv[1:] if argv is None else argv))
     try:
         status: int = arguments.run(arguments)
         sys.stdout.flush()

@@ -2,6 +2,7 @@
 
 import argparse
 import json
+import shlex
 from pathlib import Path
 
 from rcnn_odom.cli.arguments import Subcommands
@@ -55,5 +56,5 @@ def _run_report(arguments: argparse.Namespace) -> int:
     print(f"{written.table}\n")
     if written.unfinished:
         print(f"not finished, and in no mean: {written.unfinished}; the report begins with their list\n")
-    print(f"{written.markdown}\n{written.html}")
+    print(f"{shlex.quote(str(written.markdown))}\n{shlex.quote(str(written.html))}")
     return 0

@@ -7,6 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rcnn_odom.cli.arguments import Subcommands, whole_number
+from rcnn_odom.training.overrides import written
 
 
 def add(commands: Subcommands) -> None:
@@ -88,8 +89,8 @@ def _run_simulate(arguments: argparse.Namespace) -> int:
         )
         export_kitti(sequence, root)
     tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
-    command = f"python evaluate.py data=kitti {shlex.quote(f'data.root={root}')} {tests}"
+    command = f"python evaluate.py data=kitti {written('data.root', str(root))} {tests}"
     for option, value in simulated.SENSORS[arguments.world].items():
         command += f" data.sensor.{option}={value:g}"
-    print(f"wrote {', '.join(names)} to {root}; score a trained network there: {command}")
+    print(f"wrote {', '.join(names)} to {shlex.quote(str(root))}; score a trained network there: {command}")
     return 0

@@ -1,6 +1,7 @@
 """Streaming odometry: one scan in, one pose out, in constant memory."""
 
 import math
+import shlex
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -138,7 +139,7 @@ class Odometer:
             InputError: always.
         """
         raise InputError(
-            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {path}, then "
+            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {shlex.quote(str(path))}, then "
             f"Odometer.from_onnx; at once: rcnn_odom.training.export.load_odometer({str(path)!r})"
         )
 

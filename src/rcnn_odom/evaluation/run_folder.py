@@ -3,6 +3,7 @@
 import json
 import os
 from collections.abc import Collection
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,7 @@ def read_settings(run: Path, groups: Collection[str] = ("data", "model", "traine
         InputError: there is no run, or its configuration cannot be read.
     """
     try:
-        settings = yaml.safe_load((run / CONFIG).read_text())
+        settings = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
     except OSError as error:
         raise InputError(f"{run / CONFIG}: {error.strerror}; name a run's folder, run=outputs/...") from error
     except (yaml.YAMLError, UnicodeDecodeError):
@@ -77,10 +78,23 @@ def read_metrics_file(run: Path) -> dict[str, Any]:
         OSError: there is none.
         ValueError: it is damaged, or holds something that is no number.
     """
-    content = json.loads((run / METRICS).read_text(), parse_constant=_refuse)
+    content = json.loads((run / METRICS).read_text(encoding="utf-8"), parse_constant=_refuse)
     if not isinstance(content, dict):
         raise ValueError("holds no names")
     return content
+
+
+def has_finished(run: Path) -> bool:
+    """Whether a run has its scores and they are final: not those of a training that can go on."""
+    return (run / METRICS).exists() and stopped_by(run) is None
+
+
+def stopped_by(run: Path) -> str | None:
+    """What ended a training before its last epoch, as its ``metrics.json`` says; None for others."""
+    with suppress(OSError, ValueError, AttributeError):
+        reason = (read_metrics_file(run).get("training") or {}).get("stopped_by")
+        return None if reason is None else str(reason)
+    return None
 
 
 def _refuse(constant: str) -> None:

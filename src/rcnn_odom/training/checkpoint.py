@@ -1,6 +1,7 @@
 """Trained networks from disk, never trusting the file with more than numbers."""
 
 from pathlib import Path
+from pickle import UnpicklingError
 from typing import Any
 
 import numpy as np
@@ -12,6 +13,10 @@ from rcnn_odom.models.two_numbers import steps_of
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training.modules import OdometryModule, module_for
 from rcnn_odom.training.saving import AtomicCheckpointIO
+
+ARCHIVE = b"PK\x03\x04"
+"""How every file of ``torch.save`` begins."""
+GIVE = "give RUN/checkpoints/best.ckpt of a run"
 
 OLD_PLACES = {
     "network.": "model.",
@@ -29,19 +34,38 @@ def read_checkpoint(path: str | Path) -> dict[str, Any]:
         InputError: no such file, or it holds anything but numbers, strings, lists and dictionaries: objects
             could run a stranger's code.
     """
+    _check_beginning(Path(path))
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         if not isinstance(saved, dict):
             raise TypeError(f"it holds a {type(saved).__name__}")
-    except FileNotFoundError:
-        raise InputError(f"{path}: no such checkpoint") from None
     except Exception as error:  # whatever the bytes of a stranger's file lead to
         raise _refusal(path, error) from error
     return saved
 
 
+def _check_beginning(path: Path) -> None:
+    """Refuses a file that is plainly no checkpoint, of which torch would say much.
+
+    Raises:
+        InputError: there is no such file, or it is a folder, empty, or no archive as torch writes them.
+    """
+    try:
+        with path.open("rb") as file:
+            beginning = file.read(len(ARCHIVE))
+    except FileNotFoundError:
+        raise InputError(f"{path}: no such checkpoint; {GIVE}") from None
+    except OSError as error:
+        raise InputError(f"{path}: not a checkpoint that can be read ({error.strerror}); {GIVE}") from error
+    if beginning != ARCHIVE:
+        what = "not a checkpoint" if beginning else "empty, not a checkpoint"
+        raise InputError(f"{path}: {what}; {GIVE}")
+
+
 def _refusal(path: str | Path, error: Exception) -> InputError:
     reason = f"{type(error).__name__}: {error}".splitlines()[0]
+    if isinstance(error, UnpicklingError):  # torch adds how to load it all the same
+        reason = "it holds more than numbers"
     return InputError(
         f"{path}: not a checkpoint of this project, or of an older version ({reason}); train again"
     )
@@ -70,9 +94,9 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
         raise _refusal(path, error) from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
-    if sensor is not None and settings["sensor"] != sensor.as_dict():
+    if sensor is not None and (own := Sensor(**settings["sensor"])) != sensor:
         raise InputError(
-            f"{path}: trained for {Sensor(**settings['sensor'])}, but the data has {sensor}; "
+            f"{path}: trained for {own}, but the data has {sensor}; "
             "set data.sensor as in training, or train on this data"
         )
     return module.eval()

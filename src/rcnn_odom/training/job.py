@@ -13,15 +13,18 @@ from typing import TypeVar
 
 import yaml
 from hydra.core.hydra_config import HydraConfig
-from hydra.errors import HydraException
+from hydra.errors import HydraException, OverrideParseException
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import ERROR
+from rcnn_odom.training.overrides import explain, is_path, read_paths, written
 from rcnn_odom.training.run_state import find_stopped
 from rcnn_odom.training.settings import RENAMED, plain
 from rcnn_odom.training.sweep import folder_name
+from rcnn_odom.training.terminal import show_any_text
+from rcnn_odom.training.trainer_options import refusal
 
 log = logging.getLogger(__name__)
 
@@ -72,6 +75,10 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
     """
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
     try:
+        if HydraConfig.get().job.chdir:
+            raise InputError(
+                "hydra.job.chdir=true: paths are relative to where the command was started; leave it out"
+            )
         if in_sweep():
             if any(override.split("=")[0] == "run_dir" for override in HydraConfig.get().overrides.task):
                 raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
@@ -90,7 +97,7 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
             _failed.append(error)
         if in_sweep():
             with suppress(OSError):  # the error itself may be that nothing can be written
-                (folder / ERROR).write_text(" ".join(f"{type(error).__name__}: {error}".split()) + "\n")
+                (folder / ERROR).write_text(_one_line(f"{type(error).__name__}: {error}") + "\n", "utf-8")
         if in_sweep() or not is_users:
             raise
         return None
@@ -102,6 +109,12 @@ def run_command(main: Callable[[], object]) -> int:
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
     logging.raiseExceptions = False  # a log on a full disk would otherwise print a traceback for every line
+    show_any_text()
+    try:
+        sys.argv[1:] = read_paths(sys.argv[1:])
+    except InputError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 1
     try:
         main()
     except KeyboardInterrupt:
@@ -109,21 +122,55 @@ def run_command(main: Callable[[], object]) -> int:
     except InputError:  # of a sweep's job, which has told
         return 1
     except (HydraException, OmegaConfBaseException, OSError, yaml.YAMLError) as error:
-        # What follows is Hydra's own place in the configuration, not the user's mistake.
-        message = re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0]
-        # An unknown model= or data= is one of Hydra's errors and one of the system's.
-        is_folder = isinstance(error, OSError) and not isinstance(error, HydraException)
-        hint = "; choose another outputs= or run_dir=" if is_folder else ""
-        for before, now in RENAMED.items():
-            if f"'{before}" in message:
-                message = f"{before} has become {now}; set that"
-        print(f"error: {' '.join(message.split())}{hint}", file=sys.stderr)
+        print(f"error: {_explain(error)}", file=sys.stderr)
         return 1
     except ValueError as error:
         told = str(error).startswith(HYDRAS_OWN) or (_failed and str(error) == NO_JOB_SUCCEEDED)
         if not told:
             raise
         # Why each job failed is already logged.
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        print(f"error: {_one_line(str(error))}", file=sys.stderr)
         return 1
     return 1 if _failed else 0
+
+
+def _one_line(text: str) -> str:
+    return " ".join(text.split())
+
+
+def _explain(error: Exception) -> str:
+    """One line on what Hydra or the system did not accept: what is wrong, and what to do."""
+    if isinstance(error, OverrideParseException):
+        return explain(error.override)
+    # What follows is Hydra's own place in the configuration, not the user's mistake.
+    message = _one_line(re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0])
+    for before, now in RENAMED.items():
+        if f"'{before}" in message:
+            return f"{before} has become {now}; set that"
+    if found := re.search(r"Could not find '([^']*)/([^'/]*)' Available options in '.*?': (.*)", message):
+        group, chosen, names = found.groups()
+        return f"{group}={chosen}: there is no such choice; there are {', '.join(names.split())}"
+    if found := re.match(r"Could not override '([\w.]+)'", message):
+        return _explain_name(found[1])
+    if found := re.match(r"Ambiguous value for argument '(.*?)=(.*?)' 1\.", message):
+        return _explain_commas(*found.groups())
+    # An error of Hydra may be one of the system's too.
+    is_folder = isinstance(error, OSError) and not isinstance(error, HydraException)
+    return message + ("; choose another outputs= or run_dir=" if is_folder else "")
+
+
+def _explain_name(name: str) -> str:
+    """On an option that is not in the configuration."""
+    if name.startswith("trainer."):
+        return refusal(name.removeprefix("trainer.")) or f"{name}: is not set yet; write +{name}=..."
+    return f"{name}: there is no such option; --help shows those that there are"
+
+
+def _explain_commas(name: str, value: str) -> str:
+    if is_path(name):
+        return (
+            f"{name}={value}: Hydra cannot read ',' in a value without quotes; write {written(name, value)}"
+        )
+    return (
+        f"{name}={value}: several values; write '{name}=[{value}]' for a list, or add -m to run each of them"
+    )

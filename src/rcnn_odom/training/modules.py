@@ -202,9 +202,14 @@ class OdometryModule(L.LightningModule):
         optimizer = torch.optim.Adam([p for p in self.parameters() if p.requires_grad], lr=rate, fused=True)
         # Not the trainer's own count, which makes the loader before a checkpoint can tell it where to go on.
         assert self.trainer.max_epochs is not None
-        steps = self.trainer.max_epochs * self._data.batches_per_epoch
+        steps = self.trainer.max_epochs * steps_per_epoch(self.trainer.limit_train_batches, self._data)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
+
+
+def steps_per_epoch(limit: float | None, data: OdometryDataModule) -> int:
+    """Steps of an epoch that ``trainer.limit_train_batches`` may cut; Lightning's 1.0 cuts nothing."""
+    return min(limit, data.batches_per_epoch) if isinstance(limit, int) else data.batches_per_epoch
 
 
 class PaperModule(OdometryModule):

@@ -10,7 +10,7 @@ import lightning as L
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.training.saving import SIGNALS, Stopped
+from rcnn_odom.training.saving import SIGNALS, Stopped, TimeUp
 
 # It warns of every process that it ends because another one has failed.
 logging.getLogger("torch.multiprocessing").setLevel(logging.ERROR)
@@ -23,6 +23,7 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
     Raises:
         InputError: one of them met a mistake of the user, or was killed.
         Stopped: they were asked to stop, and have saved.
+        TimeUp: they have had their time, and have saved.
     """
     with _signals_passed_on(trainer) as asked:
         try:
@@ -48,6 +49,8 @@ def _translate(error: ProcessRaisedException, *, asked: bool) -> Exception:
             return InputError(f"{message.strip()}; make room, and the same command goes on")
         if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
             return Stopped()
+        if kind == f"{TimeUp.__module__}.{TimeUp.__name__}":
+            return TimeUp()
     return error
 
 

@@ -22,11 +22,14 @@ from rcnn_odom.evaluation.run_folder import (
     LAST,
     METRICS,
     RUNNING,
+    has_finished,
     read_metrics_file,
     read_settings,
+    stopped_by,
 )
 from rcnn_odom.files import lock_if_free, one_at_a_time, write_atomically
 from rcnn_odom.training.settings import Settings
+from rcnn_odom.training.trainer_options import WITHOUT_EFFECT
 
 if TYPE_CHECKING:  # torch would make --help slow
     from rcnn_odom.training.datamodule import OdometryDataModule
@@ -36,7 +39,7 @@ log = logging.getLogger(__name__)
 PACKAGE = Path(__file__).parents[1]
 DECIDING = (
     "geometry.py",
-    *("models/*.py", "recordings/*.py", "simulation/**/*.py"),
+    *("models/*.py", "recordings/**/*.py", "simulation/**/*.py"),
     *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/fresh_worlds.py"),
     *("training/stages.py", "training/checkpoint.py", "training/saving.py", "training/machine.py"),
     *("evaluation/drift.py", "evaluation/drift_metric.py"),
@@ -52,6 +55,12 @@ LINKED = (
 
 ELSEWHERE = {"run_dir": None, "outputs": None}
 """Settings that say where a run is, not what it is."""
+
+
+def _deciding(settings: Settings) -> Settings:
+    """The settings that say what a run is, whatever time it was given."""
+    trainer = settings["trainer"]
+    return settings | ELSEWHERE | {"trainer": trainer | dict.fromkeys(WITHOUT_EFFECT)}
 
 
 class State(Enum):
@@ -99,8 +108,8 @@ def state_of(
         InputError: the folder has a configuration that is none of a run.
     """
     begun = (run / CONFIG).exists()
-    is_same = begun and read_settings(run) | ELSEWHERE == settings | ELSEWHERE
-    if (run / METRICS).exists():
+    is_same = begun and _deciding(read_settings(run)) == _deciding(settings)
+    if has_finished(run):
         metrics = _metrics_of(run) if is_same else {}
         finished = metrics and (wanted is None or metrics.get("fingerprint") == wanted.settings)
         return Found(State.FINISHED if finished else State.OTHER, run)
@@ -125,9 +134,10 @@ def _metrics_of(run: Path) -> dict[str, Any]:
 def _find_twin(outputs: Path, wanted: Fingerprints) -> Path | None:
     """The newest finished run with these fingerprints."""
     for path in sorted(outputs.rglob(METRICS), key=lambda path: path.lstat().st_mtime, reverse=True):
-        metrics = _metrics_of(path.parent) if (path.parent / BEST).exists() else {}
+        run = path.parent
+        metrics = _metrics_of(run) if (run / BEST).exists() and stopped_by(run) is None else {}
         if not path.is_symlink() and (metrics.get("fingerprint"), metrics.get("code")) == wanted:
-            return path.parent
+            return run
     return None
 
 
@@ -171,7 +181,7 @@ def entered(run: Path, settings: Settings) -> Iterator[None]:
     Raises:
         InputError: it is finished, has other settings, is trained by another process, or cannot be written.
     """
-    if (run / METRICS).exists():
+    if has_finished(run):
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
     if state_of(run, settings).state is State.OTHER:
         raise InputError(
@@ -181,7 +191,7 @@ def entered(run: Path, settings: Settings) -> Iterator[None]:
         run.mkdir(parents=True, exist_ok=True)
         if not _claim(run):
             raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
-        if (run / METRICS).exists():  # finished by another process since the first look
+        if has_finished(run):  # by another process since the first look
             _release(run)
             raise InputError(f"{run}: holds a finished run; choose another run_dir")
         for left_over in (run / LAST).parent.glob(".*.partial"):  # of a process that was killed
@@ -240,7 +250,7 @@ def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
     if settings["data"].get("fresh_worlds"):  # drives that are not among the recordings yet
         data["fresh_worlds"] = settings["data"]["reader"]
-    trainer = settings["trainer"]
+    trainer = {name: value for name, value in settings["trainer"].items() if name not in WITHOUT_EFFECT}
     precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
     parts = [recordings, data, settings["model"], trainer | {"precision": precision}, settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]

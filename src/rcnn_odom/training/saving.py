@@ -22,13 +22,17 @@ from rcnn_odom.files import write_atomically
 EVERY = 60.0
 """Seconds between checkpoints within an epoch; saving the largest network takes less than one."""
 SIGNALS = (signal.SIGINT, signal.SIGTERM)
-CONTINUE, SAVE, STOP = 0, 1, 2
+CONTINUE, SAVE, TIME_UP, STOP = 0, 1, 2, 3
 """What a process wants to happen after a step; the most that any of them wants is done."""
 STDERR = 2
 
 
 class Stopped(Exception):
     """Training was asked to stop, and has saved what it needs to go on."""
+
+
+class TimeUp(Exception):
+    """Training has had the time that it was given, and has saved what it needs to go on."""
 
 
 class AtomicCheckpointIO(TorchCheckpointIO):
@@ -82,16 +86,24 @@ class Best(ModelCheckpoint):
 class Saving(Callback):
     """Saves everything that a training needs to go on bit for bit, and stops it when it is asked to.
 
+    Lightning's own timer would count the time of all sittings, and let a last validation in the middle of an
+    epoch choose the best checkpoint.
+
     A checkpoint is written at the end of every epoch, every ``EVERY`` seconds within one, and at the first
     Ctrl-C or SIGTERM, which lets a step or a validation under way come to its end. A second one stops at
     once.
 
     Args:
         path: of the checkpoint.
+        seconds: of training in this sitting, its validation included, after which it stops; a step is always
+            done. None: never.
+
+    Attributes:
+        spent: seconds of them that are gone before training starts.
     """
 
-    def __init__(self, path: Path) -> None:
-        self.path = path
+    def __init__(self, path: Path, seconds: float | None = None) -> None:
+        self.path, self.seconds, self.spent = path, seconds, 0.0
         self._asked_to_stop = False
         self._within_epoch = False
         self._last_saved = 0.0
@@ -99,7 +111,7 @@ class Saving(Callback):
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Listens to the signals from now on."""
-        self._last_saved = time.monotonic()
+        self._last_saved = self._started = time.monotonic()
         self._several = trainer.world_size > 1
         if threading.current_thread() is threading.main_thread():  # no other can
             self._handlers = {number: signal.signal(number, self._on_signal) for number in SIGNALS}
@@ -128,18 +140,25 @@ class Saving(Callback):
         if trainer.is_last_batch:
             return
         due = SAVE if time.monotonic() - self._last_saved > EVERY else CONTINUE
-        wanted = self._agree(trainer, STOP if self._asked_to_stop else due)
+        wanted = self._agree(trainer, max(due, self._wish()))
         if wanted:
             self._save(trainer)
-        if wanted == STOP:
-            raise Stopped
+        _end(wanted)
+
+    def _wish(self) -> int:
+        """What this process wants after a step or an epoch."""
+        if self._asked_to_stop:
+            return STOP
+        is_over = self.seconds is not None and time.monotonic() - self._started + self.spent > self.seconds
+        return TIME_UP if is_over else CONTINUE
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Called after the validation."""
         self._save(trainer)
         self._within_epoch = False
-        if self._agree(trainer, STOP if self._asked_to_stop else CONTINUE) == STOP:
-            raise Stopped
+        wanted = self._agree(trainer, self._wish())
+        is_last = trainer.current_epoch + 1 == trainer.max_epochs
+        _end(CONTINUE if is_last and wanted == TIME_UP else wanted)
 
     def _agree(self, trainer: L.Trainer, wanted: int) -> int:
         """The most that any of the processes wants, so that all do the same."""
@@ -163,3 +182,9 @@ class Saving(Callback):
             signal.signal(*self._handlers.popitem())
 
     on_exception = on_train_end  # type: ignore[assignment]
+
+
+def _end(wanted: int) -> None:
+    """Ends a training that has been saved, if that is wanted."""
+    if wanted >= TIME_UP:
+        raise Stopped if wanted == STOP else TimeUp

@@ -2,6 +2,7 @@
 
 import logging
 import os
+import shlex
 from pathlib import Path
 
 from omegaconf import DictConfig
@@ -17,6 +18,7 @@ from rcnn_odom.training.checkpoint import load_module
 from rcnn_odom.training.run_state import write_config, write_json
 from rcnn_odom.training.settings import plain
 from rcnn_odom.training.stages import build_datamodule, build_trainer, score_module
+from rcnn_odom.training.trainer_options import refuse_options_of_training
 
 log = logging.getLogger(__name__)
 
@@ -36,13 +38,16 @@ def evaluate(cfg: DictConfig) -> Report:
             f"model={variant}: a trained network is scored by its run, run=outputs/...; leave out model="
         )
     if variant and not cfg.get("data"):
-        raise InputError(f"model={variant} needs recordings: add data=simulated, indoor, kitti or carmen")
+        raise InputError(
+            f"model={variant} needs recordings: add data=simulated, indoor, kitti, kitti_raw or carmen"
+        )
     chosen = plain(cfg)
+    refuse_options_of_training(chosen["trainer"])
     settings, metrics = _score_model(chosen) if variant else _score_run(chosen)
     folder = Path(chosen["run_dir"])
     write_config(folder, settings)
     write_json(folder / METRICS, metrics)
-    log.info("all of it is in %s", folder)
+    log.info("all of it is in %s", shlex.quote(str(folder)))
     return metrics
 
 

@@ -1,6 +1,8 @@
 """A run's configuration as plain values, with the mistakes that Hydra cannot see found early."""
 
-from dataclasses import dataclass
+import re
+from dataclasses import dataclass, fields
+from pathlib import Path
 from typing import Any
 
 from omegaconf import DictConfig, OmegaConf
@@ -12,12 +14,11 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.options import check_options, option
 from rcnn_odom.recordings.formats import find_format
 from rcnn_odom.training.defaults import default
+from rcnn_odom.training.overrides import PATHS
+from rcnn_odom.training.trainer_options import TrainerOptions, refuse_names, shorten_if_wanted
 
 # For conf/model.
 OmegaConf.register_new_resolver("default", default, replace=True)
-
-PATHS = ("root", "reference", "pretrained", "run", "run_dir", "outputs")
-"""Options that may look like a number on the command line, ``data.root=2011``, and are a path."""
 
 RENAMED = {
     "data.beta": "model.beta",
@@ -68,15 +69,6 @@ class DataOptions:
 
 
 @dataclass(kw_only=True)
-class TrainerOptions:
-    """Options of Lightning's Trainer that this project knows; others go to it as they are."""
-
-    precision: str = option(choices=("auto", "bf16-mixed", "32-true"))
-    gradient_clip_val: float | None = option(above=0, wanted="null, which clips nothing, or a number above 0")
-    gradient_clip_algorithm: str = option(choices=("norm",))
-
-
-@dataclass(kw_only=True)
 class Options:
     """What every run has, whatever its data and its model."""
 
@@ -99,6 +91,7 @@ def plain(cfg: DictConfig) -> Settings:
             raise InputError(f"{group} has become {RENAMED[group]}; set that")
     # Before others are looked up by it, where Hydra would name those and not the mistake.
     _check(given, complete=False)
+    _check_data_names(given.get("data") or {})
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
     except OmegaConfBaseException as error:
@@ -111,6 +104,7 @@ def plain(cfg: DictConfig) -> Settings:
     _check(settings, complete=True)
     if (settings.get("model") or {}).get("apply", data.get("apply")) != data.get("apply"):
         raise InputError("model.apply is that of the data, by which the floor is scored too; set data.apply")
+    shorten_if_wanted(settings)
     return settings
 
 
@@ -118,6 +112,7 @@ def _check(settings: Settings, complete: bool) -> None:
     """Compares the settings with their options; a model's have to be all there when they are complete."""
     data, model = settings.get("data") or {}, dict(settings.get("model") or {})
     check_options(Options, settings, "", partly=True)
+    refuse_names(settings.get("trainer") or {})
     check_options(DataOptions, data, "data.", partly=True)
     for group, key in (("data", "reader"), ("model", "variant")):
         if complete and settings.get(group) and not settings[group].get(key):
@@ -131,9 +126,35 @@ def _check(settings: Settings, complete: bool) -> None:
         settings["model"] |= model  # with the defaults of what was left out
 
 
-def _name_paths(settings: Settings) -> None:
+def _check_data_names(data: Settings) -> None:
+    """Refuses an option of the data that nobody reads: neither this project nor the format of the recordings.
+
+    Args:
+        data: options before they are resolved; the format's are those that ``data.reader`` refers to.
+    """
+    form = str(data.get("reader", {}).get("format"))
+    if "${" in form or form == "None":
+        return
+    read = {each.name for each in fields(DataOptions)} | {"name", "fresh_worlds", "keep_worlds"}
+    read |= {each.name for each in fields(getattr(find_format(form), "Options", DataOptions))}
+    known = [name for name in data if name in read or re.search(rf"\$\{{[^}}]*\b{name}\b", str(data))]
+    for name in data:
+        if name not in known:
+            raise InputError(f"data.{name}: there is no such option; there are {', '.join(sorted(known))}")
+
+
+def _name_paths(settings: Settings, prefix: str = "") -> None:
+    """Makes paths out of what looks like numbers, with the user's home for ``~``.
+
+    Raises:
+        InputError: a path is empty.
+    """
     for key, value in settings.items():
         if isinstance(value, dict):
-            _name_paths(value)
+            _name_paths(value, f"{prefix}{key}.")
         elif key in PATHS and value is not None:
+            if not str(value).strip():
+                raise InputError(f"{prefix}{key}= is an empty path; give one, or leave it out")
             settings[key] = str(value)
+            if settings[key].startswith("~"):
+                settings[key] = str(Path(value).expanduser())

@@ -2,8 +2,10 @@
 
 import logging
 import pickle
+import shlex
 import shutil
 import sys
+import time
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
@@ -25,7 +27,7 @@ from rcnn_odom.recordings.trajectory import flatten
 from rcnn_odom.training.checkpoint import calibrate, load_module, read_checkpoint
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import resolve_precision
-from rcnn_odom.training.modules import OdometryModule, module_for
+from rcnn_odom.training.modules import OdometryModule, module_for, steps_per_epoch
 from rcnn_odom.training.processes import one_line_errors
 from rcnn_odom.training.run_state import (
     Fingerprints,
@@ -37,8 +39,9 @@ from rcnn_odom.training.run_state import (
     state_of,
     write_json,
 )
-from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped
+from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped, TimeUp
 from rcnn_odom.training.tensorboard import Layout, log_run
+from rcnn_odom.training.trainer_options import seconds_of
 from rcnn_odom.training.training_log import TrainingLog
 
 log = logging.getLogger(__name__)
@@ -87,9 +90,9 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     Raises:
         InputError: the devices or the precision that were asked for are not to be had.
     """
-    options = dict(settings["trainer"])
+    options = {name: value for name, value in settings["trainer"].items() if name != "max_time"}
     options["precision"] = resolve_precision(options["precision"], options["accelerator"])
-    if options["devices"] != 1 and "strategy" not in options:
+    if options["devices"] != 1 and _has_one_process(options):
         raise InputError(
             f"trainer.devices={options['devices']}: several devices train by trainer=ddp trainer.devices=..."
         )
@@ -116,17 +119,27 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
     return trainer
 
 
+def _has_one_process(options: Settings) -> bool:
+    devices = options["devices"]
+    return "strategy" not in options and not (isinstance(devices, list) and len(devices) == 1)
+
+
 def _training_options(settings: Settings, run: Path) -> Settings:
+    max_time = settings["trainer"].get("max_time")
+    saving = Saving(run / LAST, seconds_of(max_time) if max_time else None)
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [Layout(), TrainingLog(), Best(run / BEST), Saving(run / LAST)],
+        "callbacks": [Layout(), TrainingLog(), Best(run / BEST), saving],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
     }
 
 
-def train(settings: Settings, *, reuse: bool = False) -> Report:
+def train(settings: Settings, *, reuse: bool = False) -> Report | None:
     """Everything that one run does; returns what its ``metrics.json`` holds.
+
+    None after ``trainer.max_time`` has stopped its first stage: the second cannot begin before the first is
+    whole, and so there is nothing to score.
 
     Args:
         settings: its configuration, plain.
@@ -156,9 +169,12 @@ def train(settings: Settings, *, reuse: bool = False) -> Report:
             with one_at_a_time(outputs / "cache", wanted.settings, "training the same"):
                 metrics = train_module(settings, datamodule, trainer, wanted, reuse=reuse)
     except (KeyboardInterrupt, SystemExit, Stopped):  # Lightning ends by the second after the first
-        log.error("stopped; the same command goes on from what is in %s", run)
+        log.error("stopped; the same command goes on from what is in %s", shlex.quote(str(run)))
         raise KeyboardInterrupt from None
-    log.info("all of it is in %s; look at it with: tensorboard --logdir %s", run, settings["outputs"])
+    except TimeUp:  # has been told
+        return None
+    look = f"tensorboard --logdir {shlex.quote(settings['outputs'])}"
+    log.info("all of it is in %s; look at it with: %s", shlex.quote(str(run)), look)
     return metrics
 
 
@@ -184,6 +200,9 @@ def train_module(
 
     Returns:
         What ``metrics.json`` holds.
+
+    Raises:
+        TimeUp: the first stage has not been finished in ``trainer.max_time``.
     """
     run = Path(settings["run_dir"])
     metrics: Report = {"fingerprint": wanted.settings, "code": wanted.code, "seed": settings["seed"]}
@@ -195,10 +214,16 @@ def train_module(
     module = calibrate(run / BEST, datamodule.drives["val"])
     metrics |= {"variant": module.variant, "data": settings["data"]["name"]}
     metrics |= score_module(module, datamodule, trainer, settings["data"], run)
-    assert isinstance(trainer.logger, TensorBoardLogger)
-    log_run(trainer.logger, settings, metrics, settings["model"]["epochs"] * datamodule.batches_per_epoch)
+    training = metrics["training"]
+    if "stopped_by" not in training:
+        assert isinstance(trainer.logger, TensorBoardLogger)
+        log_run(trainer.logger, settings, metrics, training["steps"])
     write_json(run / METRICS, metrics)
-    (run / LAST).unlink(missing_ok=True)
+    if "stopped_by" in training:
+        done = training["epochs"], settings["model"]["epochs"]
+        log.info("stopped by trainer.max_time after %d of %d epochs; the same command goes on", *done)
+    else:
+        (run / LAST).unlink(missing_ok=True)
     return metrics
 
 
@@ -215,12 +240,14 @@ def _take_weights(twin: Path, run: Path) -> Report:
 def _fit(
     settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, wanted: Fingerprints
 ) -> Report:
-    """Trains; the part of ``metrics.json`` that is about it.
+    """Trains, for as long as ``trainer.max_time`` allows; the part of ``metrics.json`` that is about it.
 
     Raises:
         InputError: the checkpoint that it would go on from belongs to another training.
+        TimeUp: the first stage has not been finished.
     """
-    last = Path(settings["run_dir"]) / LAST
+    run, begun = Path(settings["run_dir"]), time.monotonic()
+    last = run / LAST
     module = build_module(settings, datamodule)
     module.fingerprint, module.code = wanted
     metrics = _begin_with_first_stage(module, settings, datamodule)
@@ -229,17 +256,45 @@ def _fit(
         check_checkpoint(last, saved, wanted)
         log.info("going on from %s, step %d", last, saved["global_step"])
         del saved  # its maps would keep the file's place on the disk
-    with one_line_errors(trainer):
-        trainer.fit(
-            module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
-        )
-    saved = read_checkpoint(last)  # where training in other processes has left it too
+    _saving_of(trainer).spent = time.monotonic() - begun
+    stopped = {}
+    try:
+        with one_line_errors(trainer):
+            trainer.fit(
+                module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
+            )
+    except TimeUp:
+        stopped = {"stopped_by": "trainer.max_time"}
+    fitted = _read_fitted(run, steps_per_epoch(settings["trainer"].get("limit_train_batches"), datamodule))
+    fitted["training"] |= stopped
+    fitted["val"]["lengths"] = module.lengths
+    return metrics | fitted
+
+
+def _read_fitted(run: Path, steps_per_epoch: int) -> Report:
+    """How long a run was trained and its best validation, as its last checkpoint says.
+
+    Training in other processes has left it there too. A run that was stopped before its first validation has
+    no best weights yet, and gets its last ones for now: the first validation will choose others.
+    """
+    saved = read_checkpoint(run / LAST)
     (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("Best"))
-    drift = best["best_model_score"]
-    return metrics | {
-        "training": {"seconds": saved["training_log"]["seconds"], "epochs": settings["model"]["epochs"]},
-        "val": {"drift": None if drift is None else float(drift), "lengths": module.lengths},
+    if not best["best_model_path"]:
+        shutil.copyfile(run / LAST, run / BEST)
+    drift, steps = best["best_model_score"], saved["global_step"]
+    return {
+        "training": {
+            "seconds": saved["training_log"]["seconds"],
+            "epochs": steps // steps_per_epoch,
+            "steps": steps,
+        },
+        "val": {"drift": None if drift is None else float(drift)},
     }
+
+
+def _saving_of(trainer: L.Trainer) -> Saving:
+    (saving,) = (one for one in trainer.callbacks if isinstance(one, Saving))  # type: ignore[attr-defined]
+    return saving
 
 
 def _begin_with_first_stage(
@@ -249,6 +304,7 @@ def _begin_with_first_stage(
 
     Raises:
         InputError: the first stage that was given does not fit.
+        TimeUp: it has not been finished.
     """
     variant = module.model.first_stage
     if variant is None:
@@ -270,6 +326,9 @@ def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, varian
 
     One that is found has the same recordings, network, recipe and seed, and was trained by the same code;
     only the own one of a run that was stopped is kept whatever the code, and the log says so.
+
+    Raises:
+        TimeUp: ``trainer.max_time`` has stopped its training.
     """
     model = settings["model"]
     if model.get("pretrained"):
@@ -285,7 +344,10 @@ def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, varian
         if found.state not in (State.FINISHED, State.TWIN):
             log.info("first stage: no fitting %s in %s, training one", variant, outputs)
             with entered(run, settings):
-                train_module(settings, stage_data, build_trainer(settings, run), wanted)
+                metrics = train_module(settings, stage_data, build_trainer(settings, run), wanted)
+            if "stopped_by" in metrics["training"]:
+                log.info("the first stage is not whole, so that the second one has to wait")
+                raise TimeUp
         elif read_metrics_file(found.run).get("code") != wanted.code:
             log.info("the code has changed since the first stage of this run was trained; it is kept")
     return found.run / BEST

@@ -31,6 +31,7 @@ NOT_IN_ROW = (
     "data.reference",
     "data.workers",
     "data.keep_worlds",
+    "trainer.max_time",
 )
 REPEATED = (
     *("model.apply", "model.first_stage.apply", "model.first_stage.kernel_size"),

@@ -11,6 +11,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from rcnn_odom.evaluation.metrics import all_metrics
+from rcnn_odom.training.terminal import show_any_text
 
 log = logging.getLogger(__name__)
 # Lightning logs facts about the machine and advertises products; this project logs what a user needs.
@@ -47,9 +48,12 @@ class TrainingLog(Callback):
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
         """In a process that only trains, lets the first one speak."""
         if trainer.is_global_zero and not logging.getLogger().handlers:
+            show_any_text()
             logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-            for handler in map(logging.FileHandler, self._files):
-                logging.getLogger().addHandler(handler)
+            for file in self._files:
+                logging.getLogger().addHandler(
+                    logging.FileHandler(file, encoding="utf-8", errors="backslashreplace")
+                )
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
         """Starts the clock."""

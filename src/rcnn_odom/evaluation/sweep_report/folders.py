@@ -19,8 +19,10 @@ from rcnn_odom.evaluation.run_folder import (
     METRICS,
     Settings,
     flat,
+    has_finished,
     read_metrics_file,
     read_settings,
+    stopped_by,
 )
 
 Scores = dict[str, Any]
@@ -122,7 +124,7 @@ def _is_run(folder: Path) -> bool:
 def hydras(path: Path, *keys: str) -> Any:
     """A part of a file that Hydra left; None where it is not there."""
     with suppress(OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
-        return reduce(getitem, keys, yaml.safe_load(path.read_text()))
+        return reduce(getitem, keys, yaml.safe_load(path.read_text(encoding="utf-8")))
     return None
 
 
@@ -131,7 +133,7 @@ def read_run(folder: Path, name: str) -> Run:
     overrides = hydras(folder / OVERRIDES)
     overrides = tuple(map(str, overrides)) if isinstance(overrides, list) else ()
     run = Run(folder, name, "unfinished", "", {}, overrides)
-    finished = (folder / METRICS).exists()
+    finished = has_finished(folder)
     if (folder / CONFIG).exists():
         try:
             settings = flat(read_settings(folder, ("data", "model")))
@@ -146,8 +148,10 @@ def read_run(folder: Path, name: str) -> Run:
     if finished:
         return run
     if (folder / ERROR).exists():
-        problem = " ".join((folder / ERROR).read_text(errors="replace").split())
+        problem = " ".join((folder / ERROR).read_text(encoding="utf-8", errors="replace").split())
         return replace(run, status="failed", problem=problem or f"{ERROR} is empty")
+    if reason := stopped_by(folder):
+        return replace(run, problem=f"stopped by {reason}; the same command goes on")
     ended = "stopped, or still running" if run.settings else f"ended before its {CONFIG} was written"
     return replace(run, problem=f"no {METRICS}: {ended}")
 

@@ -19,7 +19,7 @@ SAME_DRIVES = tuple(
 
 NO_SETTING_OF_THEIR_OWN = re.compile(
     r"seed|run_dir|outputs|data\.(workers|keep_worlds)|data\.(reader|passes|epochs|beta|rotation_classes)\..*"
-    r"|trainer\.(accelerator|devices)"
+    r"|trainer\.(accelerator|devices|max_time.*)"
 )
 """Differences that make no setting of their own: they act through other options, or not at all."""
 

@@ -1,0 +1,156 @@
+"""Options of Lightning's Trainer: those that work here, and what to use in place of the others."""
+
+from dataclasses import dataclass, fields
+from datetime import timedelta
+from typing import Any
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.run_folder import Settings
+from rcnn_odom.options import option
+
+_VALIDATION = (
+    "validation runs over whole drives after every epoch, since the best checkpoint is chosen by it; "
+    "leave it out"
+)
+_EPOCHS = "the length of a training is one of the recipe; set model.epochs"
+_FOLDER = "a run writes into its own folder; set run_dir"
+_LOG = "TensorBoard gets a point every 10 steps and every epoch; leave it out"
+_CHECKPOINTS = "a training saves its last and its best checkpoint by itself; leave it out"
+_OWN = "this project's own are set in the code; leave it out"
+
+INSTEAD = {
+    **dict.fromkeys(
+        ("limit_val_batches", "check_val_every_n_epoch", "val_check_interval", "num_sanity_val_steps"),
+        _VALIDATION,
+    ),
+    "limit_test_batches": "scores are those of whole drives; choose fewer drives, data.test=[...]",
+    "limit_predict_batches": "nothing is predicted beside the test; leave it out",
+    "overfit_batches": "choose what is learned and validated on; set data.train=[...] data.val=[...]",
+    **dict.fromkeys(("max_epochs", "min_epochs", "max_steps", "min_steps"), _EPOCHS),
+    "accumulate_grad_batches": "a step is one batch, which the recipe counts by; set model.batch_size",
+    "num_nodes": "a run is trained on one machine; set trainer=ddp trainer.devices=...",
+    "default_root_dir": _FOLDER,
+    **dict.fromkeys(("logger", "log_every_n_steps", "enable_autolog_hparams", "model_registry"), _LOG),
+    "enable_checkpointing": _CHECKPOINTS,
+    **dict.fromkeys(("callbacks", "plugins", "use_distributed_sampler"), _OWN),
+    **dict.fromkeys(
+        ("enable_progress_bar", "enable_model_summary"), "the log has a line for each epoch; leave it out"
+    ),
+    "reload_dataloaders_every_n_epochs": "new drives come by data.fresh_worlds; leave it out",
+    **dict.fromkeys(
+        ("profiler", "barebones"),
+        "speed is measured by make bench-train, or by a profiler around it; leave it out",
+    ),
+    "inference_mode": "whole drives are scored without gradients; leave it out",
+}
+"""Options of Lightning that are refused, each with what to use instead."""
+
+ONLY_TRAINING = ("fast_dev_run", "limit_train_batches", "max_time")
+"""Options that mean nothing to ``evaluate.py``."""
+WITHOUT_EFFECT = ("max_time",)
+"""Options that do not decide what a training gives, once it has come to its end."""
+
+
+def seconds_of(max_time: Any) -> float | None:
+    """``trainer.max_time`` in seconds; None where it has no meaning.
+
+    >>> seconds_of("00:00:01:30"), seconds_of({"minutes": 2})
+    (90.0, 120.0)
+    """
+    if isinstance(max_time, str):
+        parts = [int(part) if part.isdecimal() else -1 for part in max_time.strip().split(":")]
+        if len(parts) != 4 or min(parts) < 0:
+            return None
+        max_time = dict(zip(("days", "hours", "minutes", "seconds"), parts, strict=True))
+    try:
+        seconds = timedelta(**max_time).total_seconds()
+    except (TypeError, OverflowError, ValueError):
+        return None
+    return seconds if seconds > 0 else None
+
+
+def _are_devices(devices: Any) -> bool:
+    if isinstance(devices, list):
+        return bool(devices) and all(type(one) is int and one >= 0 for one in devices)
+    return devices == "auto" if isinstance(devices, str) else bool(devices >= 1)
+
+
+@dataclass(kw_only=True)
+class TrainerOptions:
+    """``trainer``: what may be set; fields with a default need a ``+`` on the command line."""
+
+    accelerator: str
+    devices: int | str | list[Any] = option(  # noqa: RUF009
+        fits=_are_devices, wanted="a number of devices, 1 or more, or a list of theirs, for instance [0,1]"
+    )
+    precision: str = option(choices=("auto", "bf16-mixed", "32-true"))
+    gradient_clip_val: float | None = option(above=0, wanted="null, which clips nothing, or a number above 0")
+    gradient_clip_algorithm: str = option(default="norm", choices=("norm",))
+    strategy: str = option(default="auto", choices=("auto", "ddp_spawn"))
+    deterministic: bool | str | None = option(default=None, choices=("warn",), wanted="true, false or warn")
+    benchmark: bool | None = option(default=None)
+    detect_anomaly: bool = option(default=False)
+    sync_batchnorm: bool = option(default=False)
+    limit_train_batches: int | None = option(
+        default=None, above=0, wanted="a whole number of batches above 0"
+    )
+    fast_dev_run: bool | int | None = option(
+        default=None, least=0, wanted="true, or a number of training batches"
+    )
+    max_time: str | dict[str, Any] | None = option(  # noqa: RUF009
+        default=None,
+        fits=lambda max_time: seconds_of(max_time) is not None,
+        wanted="a time above 0, for instance 00:01:30:00 (days, hours, minutes, seconds) or {minutes: 90}",
+    )
+
+
+def refusal(name: str) -> str | None:
+    """Why ``trainer.NAME`` cannot be set, one sentence; None if it can be."""
+    known = sorted(each.name for each in fields(TrainerOptions))
+    if name in known:
+        return None
+    if name in INSTEAD:
+        return f"trainer.{name}: {INSTEAD[name]}"
+    return f"trainer.{name}: there is no such option; there are {', '.join(known)}"
+
+
+def refuse_names(trainer: Settings) -> None:
+    """Looks at the names of all options of the Trainer.
+
+    Raises:
+        InputError: one has no meaning here.
+    """
+    for name in trainer:
+        if reason := refusal(str(name)):
+            raise InputError(reason)
+
+
+def shorten_if_wanted(settings: Settings) -> None:
+    """Replaces ``fast_dev_run`` by what it means: one epoch of so many batches, in each stage.
+
+    So a run says in its configuration what was trained. What is null or false is left out.
+    """
+    trainer, model = settings.get("trainer") or {}, settings.get("model") or {}
+    batches = int(trainer.get("fast_dev_run") or 0)
+    for name in ONLY_TRAINING:
+        if not trainer.get(name):
+            trainer.pop(name, None)
+    if batches and "epochs" in model:
+        trainer.pop("fast_dev_run")
+        trainer["limit_train_batches"] = batches
+        model["epochs"] = 1
+        if isinstance(first_stage := model.get("first_stage"), dict):
+            first_stage["epochs"] = 1
+
+
+def refuse_options_of_training(trainer: Settings) -> None:
+    """For a command that does not train.
+
+    Raises:
+        InputError: an option is one of training.
+    """
+    for name in ONLY_TRAINING:
+        if name in trainer:
+            raise InputError(
+                f"trainer.{name}: is an option of training, and nothing is trained; leave it out"
+            )
