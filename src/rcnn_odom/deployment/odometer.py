@@ -139,8 +139,8 @@ class Odometer:
             InputError: always.
         """
         raise InputError(
-            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {shlex.quote(str(path))}, then "
-            f"Odometer.from_onnx; at once: rcnn_odom.training.export.load_odometer({str(path)!r})"
+            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {shlex.quote(str(path))}, "
+            f"then Odometer.from_onnx; at once: rcnn_odom.training.export.load_odometer({str(path)!r})"
         )
 
     def reset(self) -> None:

@@ -134,14 +134,13 @@ class _Order:
 
     @property
     def is_one_beam(self) -> bool:
-        """Of a level laser, or of a tilted one whose elevation changes little by little in a single turn."""
-        if self.together < ONE_BEAM:
-            return True
-        if self.is_laser_by_laser:
-            return False
-        steps = np.abs(np.diff(self.slope))
-        turn = np.ptp(np.unwrap(np.arctan2(self.y, self.x)))
-        return bool(np.median(steps) < 0.1 * self.together and turn < 2.5 * np.pi)
+        """Of a laser that is level, or tilted as a whole: then its slopes are those of a plane."""
+        if self.together < ONE_BEAM or self.is_laser_by_laser:
+            return self.together < ONE_BEAM
+        azimuth = np.arctan2(self.y, self.x)
+        plane = np.stack([np.ones_like(azimuth), np.cos(azimuth), np.sin(azimuth), self.closeness], axis=1)
+        fit = np.linalg.lstsq(plane, self.slope, rcond=None)[0]
+        return bool(np.std(self.slope - plane @ fit) < ONE_BEAM)
 
     def _spread(self, ring: npt.NDArray[np.int64]) -> float:
         """Standard deviation in radians about the cone of each ring, all with their top at one height."""

@@ -128,7 +128,7 @@ def test_without_rings_points_are_cut_by_elevation(tmp_path, ring_of_all):
     stream, scans = read(bag)
     for number, scan in enumerate(scans):
         check_ring(scan, number, LEVEL_RING)
-    assert "an elevation of +1.00 degrees" in stream.notes[1]
+    assert "the beam at +1.00 degrees" in stream.notes[1]
     with pytest.raises(
         InputError, match="do not say rings; leave the ring out, or cut at a height with --height"
     ):
