@@ -280,8 +280,46 @@ def test_a_stamp_of_zero_among_others_is_none(recorder):
     odometer, scans = Odometer(recorder), random_scans(30)
     stamps = [0.0 if n in (0, 7, 12, 13) else 1000 + 0.1 * n for n in range(30)]
     poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
-    assert [bool(pose.degraded) for pose in poses] == [False, True, *[False] * 28]
-    assert "clock set" in poses[1].degraded, "a first stamp of 0 may be a time"
+    assert not any(pose.degraded for pose in poses)
+    assert len(recorder.pairs) == 29
+
+
+@pytest.mark.parametrize("size", [2, 3, 10])
+def test_a_coarse_clock_is_followed(recorder, size):
+    """Stamps that several scans share, as whole seconds: soon only the time between the groups counts."""
+    odometer, scans = Odometer(recorder), random_scans(100)
+    stamps = [5.0 + PERIOD * (n // size) * size for n in range(100)]
+    poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
+    assert [pose.degraded for pose in poses[30:]] == [""] * 70
+    assert len(recorder.pairs) > 80
+
+
+def test_a_scan_that_is_sent_twice_counts_once(recorder):
+    odometer, scans = Odometer(recorder), np.repeat(random_scans(40), 2, axis=0)
+    poses = [odometer.step(scan, 1 + PERIOD * (n // 2), ANGLES) for n, scan in enumerate(scans)]
+    assert [pose.degraded.split(":")[0] for pose in poses] == ["", "late scan"] * 40
+    assert len(recorder.pairs) == 39
+
+
+@pytest.mark.parametrize("stamps", [100.0 * np.arange(1, 41), 1e6 * (-1.0) ** np.arange(40)])
+def test_a_wild_clock_is_none_after_a_while(recorder, stamps):
+    """As stamps in milliseconds."""
+    odometer = Odometer(recorder)
+    poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(random_scans(40), stamps, strict=True)]
+    kinds = [pose.degraded.split(":")[0] for pose in poses]
+    assert kinds == ["", *["clock set"] * 5, *[""] * 34]
+    assert "from here on stamps do not count" in poses[5].degraded
+    assert len(recorder.pairs) == 34
+
+
+def test_a_laser_that_does_not_fit_gives_way_to_one_that_does(recorder):
+    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    for n, scan in enumerate(scans):
+        front = Scan(scan, ANGLES, stamp=PERIOD * n, frame_id="front")
+        rear = Scan(scan[:91], ANGLES[:91], stamp=PERIOD * n - PERIOD / 2, frame_id="rear")
+        kinds = [odometer.step(each).degraded.split(":")[0] for each in (rear, front)]
+        assert kinds == (["other frame", ""] if n else ["other laser", "new frame"])
+    assert len(recorder.pairs) == 19
 
 
 def test_a_scan_of_another_frame_is_passed_over(recorder):

@@ -32,7 +32,12 @@ def scan_message(ranges, stamp):
     spacing = np.deg2rad(1.0)
     limits = {"range_min": 0.1, "range_max": 40.0, "time_increment": 0.0}
     return SimpleNamespace(
-        header=header, ranges=list(ranges), angle_min=-np.pi / 2, angle_increment=spacing, **limits
+        header=header,
+        ranges=list(ranges),
+        angle_min=-np.pi / 2,
+        angle_max=0.0,
+        angle_increment=spacing,
+        **limits,
     )
 
 

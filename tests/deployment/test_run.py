@@ -128,7 +128,10 @@ def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
     assert main(["run", model, bag, "--out", str(out)]) == 1
     assert "choose one with --topic: /a, /b" in capsys.readouterr().err
     assert main(["run", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
-    assert "the sensor's all round, one every 0.5; train a model for such a laser" in capsys.readouterr().err
+    assert (
+        "the sensor's all round, one every 0.5; train a model on recordings of such"
+        in capsys.readouterr().err
+    )
     assert not out.exists()
     assert main(["run", model, bag, "--out", str(out), "--topic", "/a"]) == 0
 
@@ -311,9 +314,9 @@ def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_pa
     message, written = start_of(scans_of(*[np.arange(0.0, 180.0)] * 40), model, tmp_path / "out")
     assert message == (
         "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
-        "degrees, one every 1; train a model for such a laser (python train.py "
-        "data.sensor.field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=90.0 ...), "
-        "or give another recording"
+        "degrees, one every 1; train a model on recordings of such a laser "
+        "(python train.py data=... data.sensor.field_of_view_deg=180 data.sensor.resolution_deg=1 "
+        "data.sensor.facing_deg=90), or give another recording"
     )
     assert written == 0
     assert not (tmp_path / "out").exists()
@@ -349,11 +352,20 @@ def test_a_run_without_one_usable_scan_says_why(model, tmp_path, ranges, says):
     assert not (tmp_path / "out").exists()
 
 
-def test_poses_do_not_wait_forever_for_a_usable_scan(model, tmp_path, monkeypatch):
-    monkeypatch.setattr("rcnn_odom.deployment.run.LONGEST_WAIT", 10)
-    rows = (Scan(np.zeros(181), np.deg2rad(FULL)) for _ in range(30))
-    _, written = start_of(ScanStream("robot.bag", rows), model, tmp_path / "out")
-    assert written == 30
+def test_a_folder_that_was_there_stays(model, tmp_path):
+    (tmp_path / "out").mkdir()
+    rows = (Scan(np.zeros(181), np.deg2rad(FULL)) for _ in range(3000))
+    start_of(ScanStream("robot.bag", rows), model, tmp_path / "out")
+    assert list((tmp_path / "out").iterdir()) == []
+    start_of(ScanStream("robot.bag", iter([Scan(np.zeros(181))])), model, tmp_path / "a" / "b")
+    assert not (tmp_path / "a").exists()
+
+
+def test_a_run_in_which_no_two_scans_can_be_compared(model, tmp_path):
+    stream = scans_of(*[FULL, HALF_OF_IT] * 20)
+    message, _ = start_of(stream, model, tmp_path / "out")
+    assert "no two of its 40 scans can be compared (20 other laser, 19 gap)" in message
+    assert (tmp_path / "out" / "summary.json").exists(), "what it was is written"
 
 
 def case(name):

@@ -96,24 +96,34 @@ def test_beams_that_fit(sensor, bearings):
         (
             HALF,
             even(0, 1, 180),
-            "field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=90.0",
+            "field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=90",
         ),
         (
             HALF,
             even(-90, 1, 91),
-            "field_of_view_deg=90 data.sensor.resolution_deg=1 data.sensor.facing_deg=-45.0",
+            "field_of_view_deg=90 data.sensor.resolution_deg=1 data.sensor.facing_deg=-45",
         ),
-        (HALF, even(-95, 1, 191), "field_of_view_deg=190 data.sensor.resolution_deg=1"),
+        (
+            HALF,
+            even(-95, 1, 191),
+            "field_of_view_deg=190 data.sensor.resolution_deg=1 data.sensor.facing_deg=0",
+        ),
         (HALF, even(-135, 0.25, 1081), "field_of_view_deg=270 data.sensor.resolution_deg=0.25"),
         (HALF, even(-180, 1, 360), "field_of_view_deg=360 data.sensor.resolution_deg=1"),
         (HALF, even(-90, 3, 61), "field_of_view_deg=180 data.sensor.resolution_deg=3"),
         (HALF, even(-90, 0.1, 1801), "field_of_view_deg=180 data.sensor.resolution_deg=0.1"),
         (ROUND, even(-90, 0.2, 901), "field_of_view_deg=180 data.sensor.resolution_deg=0.2"),
+        (
+            HALF,
+            even(90.3, 1, 180),
+            "field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=",
+        ),
+        (Sensor(1.0, 180.0, 40.0, facing_deg=90), even(-90, 1, 181), "field_of_view_deg=180"),
         (ROUND, even(0, 360 / 1024, 1024), "field_of_view_deg=360 data.sensor.resolution_deg=0.5"),
         (
             ROUND,
             even(90, 1, 181),
-            "field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=180.0",
+            "field_of_view_deg=180 data.sensor.resolution_deg=1 data.sensor.facing_deg=180",
         ),
     ],
 )
@@ -121,10 +131,18 @@ def test_beams_of_another_laser_and_the_sensor_that_fits_them(sensor, bearings, 
     check = BeamCheck(sensor)
     assert "its beams lie" in check(scan(bearings))
     message = str(check.refusal("log", "set {}"))
-    assert message.endswith(f"; set data.sensor.{advice}")
+    assert f"; set data.sensor.{advice}" in message
     options = dict(pair.split("=") for pair in re.findall(r"\w+=[-.\d]+", message))
     fitting = Sensor(**{name: float(value) for name, value in options.items()})
     assert BeamCheck(fitting)(scan(bearings)) == "", "the advice is right"
+
+
+def test_beams_that_no_sensor_fits():
+    check = BeamCheck(HALF)
+    check(scan(even(-90, 20, 10), frame_id="laser"))
+    assert str(check.refusal("log", "set {}")).endswith(
+        "one every 1 (frame laser); no sensor has them so far apart, 10 degrees at most"
+    )
 
 
 def test_several_scans_are_judged_and_again_when_they_change():

@@ -305,12 +305,18 @@ def test_single_scans_of_other_beams_have_no_returns(tmp_path):
             np.arange(-90.0, 1.0),
             "its beams lie from -90 to 0 degrees, one every 1, the sensor's from -90 to 90",
         ),
-        (np.arange(0.0, 180.0), "set data.sensor.field_of_view_deg=180 .* data.sensor.facing_deg=90.0"),
+        (np.arange(0.0, 180.0), "set data.sensor.field_of_view_deg=180 .* data.sensor.facing_deg=90"),
         (np.rad2deg(np.arange(-90.0, 91.0)), "more than a circle, as if its angles were not in radians"),
     ],
 )
 def test_a_recording_of_another_laser_is_refused(tmp_path, frames, others, degrees, says):
     with pytest.raises(InputError, match=says) as refused:
         encode_recordings([sick(frames, others, tuple(degrees))], SENSOR, tmp_path / "cache", workers=1)
-    assert str(refused.value).startswith("drive0: frame ")
+    assert str(refused.value).startswith("drive0: frame " if frames > 3 else "drive0: 3 of frames 0 to 2: ")
     assert not list((tmp_path / "cache").glob("*.npy"))
+
+
+def test_a_recording_of_which_most_scans_are_anothers_is_refused(tmp_path):
+    most = [frame for frame in range(150) if frame % 5]
+    with pytest.raises(InputError, match="drive0: 51 of frames 0 to 63: its beams lie from -90 to 0 degrees"):
+        encode_recordings([sick(150, most)], SENSOR, tmp_path, workers=1)

@@ -306,6 +306,18 @@ def test_a_recording_without_a_return_is_refused(tmp_path):
         module.load()
 
 
+def test_scans_without_a_return_are_told(tmp_path, caplog):
+    def open_flickering(name):
+        drive = open_room("short")
+        scans = [drive.read_scan(0), Scan(np.zeros(360), drive.read_scan(0).bearings)] * 2 + [
+            drive.read_scan(4)
+        ]
+        return replace(drive, read_scan=scans.__getitem__, fingerprint="flickering")
+
+    OdometryDataModule(open_flickering, ["a"], ["a"], ["a"], FULL, tmp_path, workers=1).load()
+    assert "short: 2 of 5 scans have no return that the sensor has a bin for" in caplog.text
+
+
 def test_a_laser_that_faces_aside_has_no_mirror_image(cache):
     aside = Sensor(1.0, 180.0, 40.0, facing_deg=90.0)
     with pytest.raises(

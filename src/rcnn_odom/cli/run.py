@@ -6,10 +6,12 @@ import json
 import logging
 import shlex
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from rcnn_odom.cli.arguments import Subcommands, degrees, height, whole_number
+from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
     from rcnn_odom.deployment.odometer import Odometer, Pose
@@ -42,7 +44,7 @@ def add(commands: Subcommands) -> None:
     add("--model", metavar="MODEL", help="an exported .onnx, a .ckpt, or rcnn_small, which ships along")
     add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
     add("--out", type=Path, metavar="DIR", help="folder to write to; must not hold a trajectory yet")
-    add("--topic", help="of the LaserScan or PointCloud2 messages in a bag that has several")
+    add("--topic", help="of the messages in a bag, or in JSON lines of rosbridge, that has several")
     add("--ring", type=whole_number(0), metavar="N", help="of KITTI or a point cloud (the most level one)")
     add("--height", type=height, metavar="LOW:HIGH", help="metres: cuts a slice of a point cloud, not a ring")
     add(
@@ -61,6 +63,9 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
         parser.error("give MODEL and either INPUT or --live")
     if not arguments.live and arguments.out is None:
         parser.error("--out DIR is needed")
+    of_files = [name for name in FORMAT_OPTIONS if name != "topic" and getattr(arguments, name) is not None]
+    if arguments.live and of_files:
+        parser.error(f"--{of_files[0].replace('_', '-')} is of recordings, not of --live")
 
     from rcnn_odom.deployment.run import format_summary, run
     from rcnn_odom.recordings import json_lines
@@ -69,9 +74,10 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     odometer, model = _load(paths[0], arguments.threads), Path(paths[0]).stem
     if arguments.live:
-        if isinstance(sys.stdin, io.TextIOWrapper):
-            sys.stdin.reconfigure(errors="replace")  # bytes that are no text are a line that is no scan
-        summary = run(odometer, json_lines.stream_lines(sys.stdin), model, arguments.out, _print_pose)
+        lines = _read_live()
+        summary = run(
+            odometer, json_lines.stream_lines(lines, topic=arguments.topic), model, arguments.out, _print_pose
+        )
         print(format_summary(summary), file=sys.stderr)
         return 0
     options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
@@ -81,6 +87,20 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     print(format_summary(run(odometer, stream, model, arguments.out)))
     print(f"all of it is in {shlex.quote(str(arguments.out))}")
     return 0
+
+
+def _read_live() -> Iterable[str]:
+    """The lines of standard input.
+
+    Raises:
+        InputError: there is none.
+    """
+    if sys.stdin is None:
+        raise InputError("standard input is closed; --live reads scans from it")
+    if isinstance(sys.stdin, io.TextIOWrapper):
+        # Bytes that are no text are a line that is no scan.
+        sys.stdin.reconfigure(encoding="utf-8", errors="replace")
+    return sys.stdin
 
 
 def _print_pose(pose: "Pose") -> None:

@@ -15,7 +15,11 @@ FOREVER = 1e9
 SLOW = 1.5
 """Times the period of training from which on steps are longer than a network knows."""
 LATE_IN_A_ROW = 5
-"""After so many late scans it is the clock that has been set, or that stands still."""
+"""After so many late scans it is the clock that has been set."""
+COARSE = 5
+"""After so many scans with the stamp of the one before such a stamp no longer means a late scan."""
+WILD = 5
+"""After so many jumps in a row the stamps tell nothing."""
 CLOCK_JUMP = 10.0
 """Seconds from one stamp to the next, forward or back, from which on a clock has been set."""
 LATE, CLOCK_SET = "late scan", "clock set"
@@ -49,35 +53,38 @@ class Clock:
 
     def __init__(self, trained: float) -> None:
         self._trained = trained
-        self._stands_at: float | None = None
+        self._equal, self._jumps = 0, 0
         self._forget()
 
     def _forget(self) -> None:
         self._stamp: float | None = None
-        self._expected, self._unstamped = 0.0, 0
-        self._late, self._equal = 0, 0
+        self._expected, self._unstamped, self._late = 0.0, 0, 0
         self._intervals: deque[float] = deque(maxlen=REMEMBERED)
 
-    def read(self, stamp: float | None) -> Tick:
-        """What the next stamp tells, in seconds; None, nan and inf are none, and 0 where it is no time."""
-        if stamp is None or not math.isfinite(stamp) or self._is_no_time(stamp):
+    def read(self, stamp: float | None, *, repeats: bool = False) -> Tick:
+        """What the next stamp tells.
+
+        Args:
+            stamp: seconds; None, nan and inf are none, and 0 where it is no time.
+            repeats: the scan is the very same as the one before, so that an equal stamp is right.
+        """
+        if stamp is None or not math.isfinite(stamp) or self._is_no_time(stamp, repeats):
             self._unstamped += 1
             return Tick()
-        if self._stamp is None:
+        if self._stamp is None or (self._stamp == 0 and stamp > CLOCK_JUMP):
             return self._begin(stamp)
         if abs(stamp - self._stamp) > CLOCK_JUMP:
-            was = self._stamp
-            self._forget()
-            self._begin(stamp)
-            return Tick(clock_set=f"{CLOCK_SET}: from {was:.15g} to {stamp:.15g} s, no motion is added")
+            return self._jump(stamp, self._stamp)
+        self._jumps = 0
         if stamp <= self._stamp:
+            self._equal += stamp == self._stamp and not repeats
             return self._count_late(stamp)
-        self._late, self._equal = 0, 0
+        self._late = 0
         return self._count_periods(stamp, self._stamp)
 
-    def _is_no_time(self, stamp: float) -> bool:
-        """Whether a stamp is that of a clock that stands still, or the 0 of a driver that knows none."""
-        if stamp == self._stands_at:
+    def _is_no_time(self, stamp: float, repeats: bool) -> bool:
+        """Whether a stamp says nothing: one of a coarse or wild clock, or the 0 of a driver that has none."""
+        if self._jumps >= WILD or (stamp == self._stamp and self._equal >= COARSE and not repeats):
             return True
         return stamp == 0 and self._stamp is not None and (self._stamp == 0 or abs(self._stamp) > CLOCK_JUMP)
 
@@ -86,16 +93,22 @@ class Clock:
         self._unstamped = 0
         return Tick()
 
+    def _jump(self, stamp: float, was: float) -> Tick:
+        self._forget()
+        self._begin(stamp)
+        self._jumps += 1
+        told = f"{CLOCK_SET}: from {was:.15g} to {stamp:.15g} s, no motion is added"
+        if self._jumps == WILD:
+            told += f", for the {WILD}th time in a row: from here on stamps do not count"
+        return Tick(clock_set=told)
+
     def _count_late(self, stamp: float) -> Tick:
-        self._late, self._equal = self._late + 1, self._equal + (stamp == self._stamp)
+        self._late += 1
         if self._late < LATE_IN_A_ROW:
             return Tick(late=f"{LATE}: stamp {stamp:.6f} is not after {self._stamp:.6f}, passed over")
-        periods, stands = self._late, self._equal == self._late
+        periods = self._late
         self._forget()
-        if stands:
-            self._stands_at = stamp
-        else:
-            self._begin(stamp)
+        self._begin(stamp)
         return Tick(periods)
 
     def _count_periods(self, stamp: float, before: float) -> Tick:

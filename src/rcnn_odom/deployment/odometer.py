@@ -86,11 +86,12 @@ class Odometer:
       ``LONGEST_HOLD`` periods at most. Networks do not know such long steps; comparing the scans at both
       ends all the same is several times worse (docs/deployment.md).
     - *late scan*, a stamp not after the one before: passed over, and the pose is the last one again.
-      After five of them in a row the clock is taken as set, and it goes on as after a gap; if they were
-      all equal, the clock stands still and every scan counts as the next one.
+      After five of them in a row the clock is taken as set, and it goes on as after a gap. After five scans
+      with the very stamp of the scan before the clock is coarse: such scans then count as the next ones.
     - *clock set*, a stamp more than ten seconds before or after the last one: nobody knows how much time has
       passed, so no motion is added, the step's covariance is unknown, and the new stamps are the clock from
-      there on. A stamp of 0 among others, or always, is none.
+      there on; after five jumps in a row stamps no longer count. A stamp of 0, always, at first or among
+      others, is none.
     - *other frame*, a scan of another ``frame_id`` than the scans before: passed over as of another laser.
       After five of them in a row it is the laser's (*new frame*), and no motion is added to there.
     - *other laser*, beams that do not lie where the sensor has them, or readings that cannot be metres (see
@@ -105,6 +106,11 @@ class Odometer:
 
     Args:
         stepper: the network.
+
+    Attributes:
+        description: of the network.
+        beam_check: compares the scans' beams with those that it knows.
+        estimates: steps that it has given.
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -151,6 +157,7 @@ class Odometer:
         self._position, self._motion, self._last_pose = np.zeros(3), np.zeros(3), Pose()
         self._missed, self._held, self._beams, self._spacing = 0, 0, 0, 0.0
         self._frame, self._of_other_frame, self._begun = "", 0, False
+        self._ranges, self.estimates = np.empty(0), 0
         self.beam_check = BeamCheck(self.description.sensor)
         self._clock = Clock(self.description.period)
 
@@ -185,11 +192,12 @@ class Odometer:
         stamp = None if scan.stamp is None or not math.isfinite(scan.stamp) else float(scan.stamp)
         self._present = None
         frame = scan.frame_id.lstrip("/")
-        if frame and self._frame and frame != self._frame:
+        if frame and self._frame and frame != self._frame and self.beam_check.fitting:
             self._of_other_frame += 1
             if self._of_other_frame < PATIENCE:
                 return self._pass_over(f"{OTHER_FRAME}: {frame} after {self._frame}, passed over")
-        tick = self._clock.read(stamp)
+        tick = self._clock.read(stamp, repeats=np.array_equal(scan.ranges, self._ranges))
+        self._ranges = scan.ranges
         if tick.late:
             return self._pass_over(tick.late)
         notes = self._follow_frame(frame)
@@ -210,6 +218,7 @@ class Odometer:
             self._stepper.reset()  # its state is nan as well
             return self._hold(stamp, tick.periods, [*notes, "no estimate: the last motion goes on"])
         self._motion, self._held = step.array(), 0
+        self.estimates += 1
         return self._move(stamp, step, notes)
 
     def returns(self) -> npt.NDArray[np.float32]:

@@ -5,7 +5,7 @@ import math
 import time
 from collections import Counter
 from collections.abc import Callable
-from contextlib import ExitStack, closing
+from contextlib import ExitStack, closing, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -29,9 +29,11 @@ MAP, SUMMARY = "map.png", "summary.json"
 MAP_SCANS = 2000
 """Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
 LATENCIES = 100_000
-LONGEST_WAIT = 1000
-"""Poses that wait for the first scan that can be used, before they are written all the same."""
-ANOTHER_MODEL = "train a model for such a laser (python train.py {} ...), or give another recording"
+FEW_SCANS = 6
+"""Fewer than so many need not have two that can be compared."""
+ANOTHER_MODEL = (
+    "train a model on recordings of such a laser (python train.py data=... {}), or give another recording"
+)
 
 Summary = dict[str, Any]
 
@@ -46,7 +48,7 @@ def run(
     """Poses for all scans of a stream.
 
     What is written is valid at every moment, and complete up to the scan where a stream breaks off or
-    the run is stopped. Nothing is written before there is a scan that can be used.
+    the run is stopped. Where no scan can be used nothing is left behind.
 
     Args:
         odometer: at its start.
@@ -60,7 +62,8 @@ def run(
 
     Raises:
         InputError: the folder holds a trajectory or cannot be written, the laser is another than the
-            model's, the stream has no scan, none that can be used, or breaks off.
+            model's, the stream has no scan, none that can be used, no two that can be compared, or
+            breaks off.
     """
     statistics = Statistics(stream, model, odometer)
     with ExitStack() as stack:
@@ -70,7 +73,7 @@ def run(
             for scan in stack.enter_context(closing(bar)):
                 pose = statistics.step(scan)
                 if folder:
-                    folder.add(pose, statistics.can_use)
+                    folder.add(pose)
                 if on_pose:
                     on_pose(pose)
             statistics.need_a_use()
@@ -104,7 +107,7 @@ class Statistics:
         self.can_use, sensor = False, odometer.description.sensor
         self._absent = AbsentReturns(sensor.max_range)
         if stream.beams and (reason := compare_beams(stream.beams, sensor)):
-            advice = ANOTHER_MODEL.format(stream.beams.sensor_options())
+            advice = ANOTHER_MODEL.format(stream.beams.sensor_options() or "data.sensor...")
             raise InputError(f"{stream.name}: {reason}; {advice}")
         self.degraded: Counter[str] = Counter()
         self.milliseconds = EvenSample[float](LATENCIES)
@@ -140,13 +143,17 @@ class Statistics:
         Raises:
             InputError: nothing could; the message says why.
         """
-        if self.can_use:
+        name, advice = self.stream.name, "give another recording, or correct what its laser writes"
+        if self.can_use and (self.odometer.estimates or self.scans < FEW_SCANS):
             return
+        if self.can_use:
+            counts = ", ".join(f"{count} {kind}" for kind, count in self.degraded.most_common())
+            raise InputError(f"{name}: no two of its {self.scans} scans can be compared ({counts}); {advice}")
         if self.odometer.beam_check.reason:
-            raise self.odometer.beam_check.refusal(self.stream.name, ANOTHER_MODEL)
+            raise self.odometer.beam_check.refusal(name, ANOTHER_MODEL)
         if not self.scans:
-            raise InputError(f"{self.stream.name}: no scan in it; give another recording")
-        raise InputError(f"{self.stream.name}: {self._absent}; give another recording, or mend its laser")
+            raise InputError(f"{name}: no scan in it; give another recording")
+        raise InputError(f"{name}: {self._absent}; {advice}")
 
     def summary(self) -> Summary:
         """Plain values."""
@@ -178,7 +185,7 @@ class OutputFolder:
     def __init__(self, folder: Path, stream: ScanStream, stack: ExitStack) -> None:
         self.folder, self.stream = folder, stream
         self._stack, self._written = stack, 0
-        self._waiting: list[Pose] = []
+        self._made = [each for each in (folder, *folder.parents) if not each.exists()]
         if (folder / TRAJECTORY).exists():
             raise InputError(f"{folder}: holds a trajectory already; choose another --out")
 
@@ -195,23 +202,14 @@ class OutputFolder:
                 f"{self.folder}: cannot be written ({error.strerror}); choose another --out"
             ) from error
 
-    def add(self, pose: Pose, can_use: bool) -> None:
-        """One more pose, which waits for the first scan that can be used.
+    def add(self, pose: Pose) -> None:
+        """One more pose; without a stamp it stands under its number, one that is told again under no time.
 
         Raises:
             InputError: the folder cannot be written.
         """
-        self._waiting.append(pose)
-        if not can_use and not self._written and len(self._waiting) < LONGEST_WAIT:
-            return
         if not self._written:
             self._begin()
-        for pose in self._waiting:
-            self._write(pose)
-        self._waiting = []
-
-    def _write(self, pose: Pose) -> None:
-        """A line each; without a stamp a pose stands under its number, and one told again under no time."""
         camera_pose = change_frame(pose.matrix()[None], self.stream.camera_from_laser)
         write_kitti(self._kitti, camera_pose)
         if not pose.degraded.startswith(PASSED_OVER):
@@ -220,8 +218,11 @@ class OutputFolder:
         self._written += 1
 
     def finish(self, statistics: Statistics) -> None:
-        """The map and the summary, where there is a pose."""
+        """The map and the summary, where there is a pose; nothing at all where no scan could be used."""
         if not self._written:
+            return
+        if not statistics.can_use:
+            self._remove()
             return
         from rcnn_odom.evaluation.figures import map_figure
 
@@ -230,8 +231,16 @@ class OutputFolder:
         )
         poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in statistics.sample.items])
         points = [points for _, points in statistics.sample.items]
-        title = f"{self.stream.name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"
+        name = self.stream.name.encode("utf-8", "replace").decode()  # of bytes that are no text
+        title = f"{name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"
         map_figure(title, poses, points).savefig(self.folder / MAP, dpi=150)
+
+    def _remove(self) -> None:
+        for name in (TRAJECTORY, TUM, STEPS):
+            (self.folder / name).unlink(missing_ok=True)
+        for folder in self._made:
+            with suppress(OSError):  # somebody else has put something there
+                folder.rmdir()
 
 
 def format_summary(summary: Summary) -> str:

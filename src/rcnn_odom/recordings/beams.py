@@ -6,6 +6,7 @@ import numpy as np
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
+from rcnn_odom.recordings.laser_scan import has_most_beyond
 from rcnn_odom.recordings.scan import Scan
 
 PATIENCE = 5
@@ -56,7 +57,7 @@ class Beams(NamedTuple):
     @property
     def middle(self) -> float:
         """The direction of the middle, in (-180, 180]."""
-        return 180.0 - (180.0 - self.first - self.covered / 2) % 360.0
+        return _wrap(self.first + self.covered / 2)
 
     def __str__(self) -> str:
         if self.covered == 360:
@@ -65,16 +66,26 @@ class Beams(NamedTuple):
         return f"from {start:.4g} to {start + self.covered:.4g} degrees, one every {self.spacing:.2g}"
 
     def sensor_options(self) -> str:
-        """The command-line options of a sensor for these beams."""
+        """The command-line options of a sensor for these beams; empty where none fits them."""
         resolution = min((r for r in RESOLUTIONS_DEG if r > 0.99 * self.spacing), default=RESOLUTIONS_DEG[-1])
+        if not CLOSEST * resolution < self.spacing < FARTHEST * resolution:
+            return ""
         covered, middle = self.covered, self.middle
         if round(covered + self.spacing, 1) % 5 == 0:  # the last beam of, say, 180 degrees is left out
             covered, middle = covered + self.spacing, middle + self.spacing / 2
         width = min(max(1, round(covered / resolution)) * resolution, 360.0)
-        options = f"data.sensor.field_of_view_deg={width:g} data.sensor.resolution_deg={resolution:g}"
-        if width < 360 and abs(middle) > max(resolution, self.spacing):
-            options += f" data.sensor.facing_deg={middle:.1f}"
-        return options
+        facing = (
+            round(_wrap(middle), 1) if width < 360 and abs(middle) > max(resolution, self.spacing) else 0.0
+        )
+        return (
+            f"data.sensor.field_of_view_deg={width:g} data.sensor.resolution_deg={resolution:g} "
+            f"data.sensor.facing_deg={facing:g}"
+        )
+
+
+def _wrap(degrees: float) -> float:
+    """The same direction in (-180, 180]."""
+    return 180.0 - (180.0 - degrees) % 360.0
 
 
 def find_beams(bearings: FloatArray) -> Beams:
@@ -112,7 +123,7 @@ def compare_beams(beams: Beams, sensor: Sensor) -> str:
     slack = beams.spacing + sensor.resolution_deg
     fits = covered >= LEAST_COVERED * width - slack
     if width < 360:
-        aside = abs(180.0 - (180.0 - beams.middle + sensor.facing_deg) % 360.0)
+        aside = abs(_wrap(beams.middle - sensor.facing_deg))
         fits = fits and aside + covered / 2 <= width / 2 + slack
     if fits and CLOSEST * sensor.resolution_deg < beams.spacing < FARTHEST * sensor.resolution_deg:
         return ""
@@ -125,15 +136,11 @@ def compare_beams(beams: Beams, sensor: Sensor) -> str:
 
 
 def compare_ranges(ranges: FloatArray) -> str:
-    """Why these readings (P,) cannot be metres; empty where they may be.
-
-    Readings at the largest one do not count: lasers write it where nothing came back.
-    """
-    given = ranges[(ranges > 0) & np.isfinite(ranges)]
-    far = (given > FAR) & (given < 0.98 * given.max(initial=0.0))
-    if np.count_nonzero(far) <= len(given) / 2:
+    """Why these readings (P,) cannot be metres; empty where they may be."""
+    if not has_most_beyond(ranges, FAR):
         return ""
-    return f"half of its readings are beyond {np.median(given):.4g}, which cannot be metres"
+    median = np.median(ranges[(ranges > 0) & np.isfinite(ranges)])
+    return f"half of its readings are beyond {median:.4g}, which cannot be metres"
 
 
 class BeamCheck:
@@ -145,18 +152,18 @@ class BeamCheck:
         sensor: what the scans are encoded for.
 
     Attributes:
-        fitting: scans that did fit.
-        in_a_row: scans since then that did not.
+        fitting, misfitting: scans that did fit, and that did not.
+        in_a_row: scans since the last one that did fit.
         reason: why the last one did not, in words.
         beams: of the last scan that told of them.
     """
 
     def __init__(self, sensor: Sensor) -> None:
         self.sensor = sensor
-        self.fitting, self.in_a_row, self.reason = 0, 0, ""
+        self.fitting, self.misfitting, self.in_a_row, self.reason = 0, 0, 0, ""
         self.beams: Beams | None = None
         self._seen: object = None
-        self._of_beams = ""
+        self._of_beams, self._frame = "", ""
 
     @property
     def is_for_good(self) -> bool:
@@ -169,6 +176,7 @@ class BeamCheck:
             return ""
         reason = self._compare_beams(scan) or compare_ranges(scan.ranges)
         if reason:
+            self.misfitting += 1
             self.in_a_row, self.reason = self.in_a_row + 1, reason
         else:
             self.in_a_row, self.fitting = 0, self.fitting + 1
@@ -182,11 +190,13 @@ class BeamCheck:
             remedy: what the user can do where the beams are the reason, ``{}`` for the options of a sensor
                 that they fit.
         """
-        told = self.beams.sensor_options() if self.beams and self._of_beams else ""
-        advice = (
-            remedy.format(told) if told else "correct the recording: metres, and radians between its beams"
-        )
-        return InputError(f"{name}: {self.reason}; {advice}")
+        beams = self.beams if self._of_beams else None
+        advice = "correct the recording: metres, and radians between its beams"
+        if beams and (options := beams.sensor_options()):
+            advice = remedy.format(options)
+        elif beams:
+            advice = f"no sensor has them so far apart, {FARTHEST * RESOLUTIONS_DEG[-1]:.0f} degrees at most"
+        return InputError(f"{name}: {self.reason}{self._frame}; {advice}")
 
     def _compare_beams(self, scan: Scan) -> str:
         if not scan.has_all_beams:
@@ -194,6 +204,7 @@ class BeamCheck:
         ends = None if scan.bearings is None else (scan.bearings[0], scan.bearings[-1])
         seen = len(scan.ranges), ends, scan.frame_id
         if seen != self._seen:
+            self._frame = f" (frame {scan.frame_id})" if scan.frame_id else ""
             self._seen = seen
             self._of_beams = self._judge(scan)
         return self._of_beams

@@ -66,7 +66,7 @@ class Encoding:
         """Frames start..stop-1 of one drive; a scan whose beams are not the sensor's has no returns.
 
         Raises:
-            InputError: a frame cannot be read, or several in a row, or all, are not the sensor's.
+            InputError: a frame cannot be read, or several in a row, or most, are not the sensor's.
         """
         if name not in self._opened:
             # One is enough: a worker's pieces of a drive follow each other.
@@ -78,8 +78,11 @@ class Encoding:
             scan = recording.read_scan(frame)
             if not check(scan):
                 depth[:] = self.encoder.encode(scan)
-            elif check.is_for_good or (stop - start == len(recording) == check.in_a_row):
+            elif check.is_for_good:
                 raise check.refusal(f"{name}: frame {frame}", FITTING_SENSOR)
+        # The last frames of a long recording may be few.
+        if check.misfitting > check.fitting and (start == 0 or stop - start > beams.PATIENCE):
+            raise check.refusal(f"{name}: {check.misfitting} of frames {start} to {stop - 1}", FITTING_SENSOR)
         return depths, recording.poses[start:stop]
 
 

@@ -23,7 +23,7 @@ from rcnn_odom.training.windows import Batches, FreshSampler, TrainingLoader, Wi
 log = logging.getLogger(__name__)
 
 SAMPLED_FRAMES = 50
-"""Frames of a recording of which at least one must have a return."""
+"""Frames of a recording without a return that are looked at to say why."""
 
 
 class WholeDrives(Dataset):
@@ -131,14 +131,21 @@ class OdometryDataModule(L.LightningDataModule):
                 )
 
     def _check_returns(self, recording: Recording, drive: Drive) -> None:
-        """Refuses a recording in which nothing is seen, as sampled frames tell."""
-        frames = np.unique(np.linspace(0, len(drive) - 1, SAMPLED_FRAMES).astype(int))
-        if any(drive.scans[frame].any() for frame in frames):
+        """Refuses a recording in which nothing is seen; tells how many of its scans have no return."""
+        empty = np.flatnonzero(~drive.scans.any(1))
+        if 0 < len(empty) < len(drive):
+            log.warning(
+                "%s: %d of %d scans have no return that the sensor has a bin for",
+                *(recording.name, len(empty), len(drive)),
+            )
+        if len(empty) < len(drive):
             return
         absent = AbsentReturns(self.sensor.max_range)
-        for frame in frames:
+        for frame in np.unique(np.linspace(0, len(drive) - 1, SAMPLED_FRAMES).astype(int)):
             absent.add(recording.read_scan(frame))
-        raise InputError(f"{recording.name}: {absent}; set data.sensor.max_range, or leave the recording out")
+        raise InputError(
+            f"{recording.name}: {absent}; leave the recording out, or correct what its laser writes"
+        )
 
     def _check_windows(self) -> None:
         for drive in self.drives.get("train", []):
