@@ -128,10 +128,7 @@ def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
     assert main(["run", model, bag, "--out", str(out)]) == 1
     assert "choose one with --topic: /a, /b" in capsys.readouterr().err
     assert main(["run", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
-    assert (
-        "the sensor's all round, one every 0.5; train a model on recordings of such"
-        in capsys.readouterr().err
-    )
+    assert "the sensor's all round, one every 0.5 (frame laser); train a model on" in capsys.readouterr().err
     assert not out.exists()
     assert main(["run", model, bag, "--out", str(out), "--topic", "/a"]) == 0
 

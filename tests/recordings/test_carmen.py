@@ -3,6 +3,7 @@ import gzip
 import math
 import os
 import pickle
+import re
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,9 @@ from rcnn_odom.geometry import FORWARD_CAMERA, change_frame, planar_to_poses, po
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.models.icp import ICP
 from rcnn_odom.recordings import carmen
+from rcnn_odom.recordings.beams import BeamCheck
+from rcnn_odom.recordings.carmen_log import params
+from rcnn_odom.recordings.parts import cut
 from rcnn_odom.recordings.recording import Drive, Recording
 from rcnn_odom.recordings.scan import Scan
 from scans import beams
@@ -234,6 +238,10 @@ def robotlaser(start: str, field_of_view: str, resolution: str, count: int, maxi
         ("1.570796", "3.141593", "-0.017453", 181, -1.0),
         ("1.570796", "-3.141593", "-0.017453", 180, -1.0),
         ("1.570796", "-3.141593", "0", 181, -1.0),
+        # The sign of the resolution stands before that of the field of view.
+        ("-1.570796", "-3.141593", "0.017453", 181, 1.0),
+        ("-1.570796", "-3.141593", "0.017453", 180, 1.0),
+        ("1.570796", "3.141593", "-0.017453", 180, -1.0),
         ("1.570796", "0", "-0.017453", 181, -1.0),
     ],
 )
@@ -334,6 +342,42 @@ def test_an_absurd_maximum_is_unknown(tmp_path: Path, maximum: str) -> None:
     np.testing.assert_allclose(sequence.read_scan(0).ranges, np.arange(1, 10) / 100)
 
 
+def with_maximum(root: Path, maximum: str, unit: float = 1.0) -> Path:
+    """A log of ROBOTLASER1 lines that say this maximum; their readings are in so many metres."""
+    make_carmen(root, "robot", frames=30, fmt="ROBOTLASER1")
+    lines = (root / "robot.log").read_text().splitlines()
+    for number, line in enumerate(lines):
+        words = line.split()
+        if words[0] == "ROBOTLASER1":
+            words[5] = maximum
+            words[9:189] = [f"{float(word) / unit:.2f}" for word in words[9:189]]
+            lines[number] = " ".join(words)
+    return write_log(root / "said.log", lines)
+
+
+@pytest.mark.parametrize("maximum", ["4", "0.5"])
+def test_readings_stand_before_the_maximum_of_robotlaser_lines(tmp_path: Path, maximum: str) -> None:
+    path = with_maximum(tmp_path, maximum)
+    right, said = carmen.load("robot", root=tmp_path), carmen.load("said", root=tmp_path)
+    for frame, streamed in enumerate(carmen.stream(path).scans):
+        ranges = said.read_scan(frame).ranges
+        # All but the constant of no return, which lies beyond what a sensor sees.
+        np.testing.assert_array_equal(
+            np.where(ranges == MAX_READING, np.inf, ranges), right.read_scan(frame).ranges
+        )
+        np.testing.assert_array_equal(streamed.ranges, ranges)
+    assert "30 lines' maximum is not believed: most readings lie beyond it" in said.notes
+    assert "not believed" not in notes_of(right)
+
+
+def test_centimetres_are_told_whatever_the_maximum(tmp_path: Path) -> None:
+    for scan in carmen.stream(with_maximum(tmp_path, "81.91", unit=0.01)).scans:
+        assert re.search(
+            r"half of its readings are .*cannot be metres", BeamCheck(Sensor(1.0, 180.0, 40.0))(scan)
+        )
+    assert "30 lines' maximum is not believed" in notes_of(carmen.load("said", root=tmp_path))
+
+
 # PARAM lines about the laser of FLASER lines
 
 
@@ -418,6 +462,103 @@ def test_params_that_contradict_each_other(tmp_path: Path, params: list[str], ma
     assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-135, 0.5))
 
 
+@pytest.mark.parametrize(
+    ("params", "count"),
+    [
+        ([f"{RESOLUTION} 0.0174533"], 180),
+        ([f"{RESOLUTION} 0.017"], 181),
+        ([f"{RESOLUTION} 0.004363"], 1081),
+        ([f"{RESOLUTION} 0.0174533"], 360),
+        ([f"{FOV} 3.141593", f"{RESOLUTION} 0.0174533"], 180),
+        ([f"{FOV} 4.712389", f"{RESOLUTION} 0.00873"], 541),
+    ],
+)
+def test_a_resolution_in_radians_is_told(tmp_path: Path, params: list[str], count: int) -> None:
+    line = flaser(" ".join(["1.5"] * count))
+    with pytest.raises(InputError, match="is it in radians, not degrees") as raised:
+        load_lines(tmp_path, *params, line)
+    for part in (f"{params[-1]} (degrees)", "; say", "data.field_of_view_deg=", "--field-of-view-deg"):
+        assert part in str(raised.value)
+    with pytest.raises(InputError, match="is it in radians, not degrees"):
+        carmen.stream(tmp_path / "log.log")
+    sequence = load_lines(tmp_path, *params, line, field_of_view_deg=180.0)
+    assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-90, 180 / (count - count % 2)))
+
+
+@pytest.mark.parametrize(
+    ("resolution", "count", "covered"), [("1", 4, 4), ("0.1", 91, 9), ("0.0625", 641, 40)]
+)
+def test_narrow_and_fine_lasers_are_in_degrees(
+    tmp_path: Path, resolution: str, count: int, covered: int
+) -> None:
+    sequence = load_lines(tmp_path, f"{RESOLUTION} {resolution}", flaser(" ".join(["1.5"] * count)))
+    assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-covered / 2, float(resolution)))
+
+
+@pytest.mark.parametrize(
+    ("param", "fault"),
+    [
+        ("laser_front_laser_fov 3,1416", "laser_front_laser_fov 3,1416 is no number"),
+        ("laser_front_laser_fov = 4.712389", "laser_front_laser_fov = is no number"),
+        ("laser_frontlaser_resolution nan", "laser_frontlaser_resolution nan is no number"),
+        ("laser_front_laser_fov -4.712389", "laser_front_laser_fov -4.712389 is not above 0"),
+        ("robot_front_laser_max none", "robot_front_laser_max none is no number"),
+        ("robot_front_laser_max " + "9" * 5000, f"robot_front_laser_max {'9' * 40} is no number"),
+        ("laser_front_laser_fov 0", ""),
+        ("laser_rear_laser_fov 3,1416", ""),
+    ],
+)
+def test_a_param_that_is_no_number_is_told(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture, param: str, fault: str
+) -> None:
+    lines = [f"PARAM {param} nohost 0"] * 3 + [flaser(" ".join(["1.5"] * 361))]
+    sequence = load_lines(tmp_path, *lines)
+    assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-90, 0.5))
+    told = [f"the log's PARAM {fault}, not used"] if fault else []
+    assert [note for note in sequence.notes if "PARAM" in note] == told
+    assert len(list(carmen.stream(tmp_path / "log.log").scans)) == 1
+    assert caplog.messages == [f"{tmp_path / 'log.log'}: {note}" for note in told]
+
+
+HALF_TURN, ONE_DEGREE = f"{FOV} 3.141593 nohost 0", f"{RESOLUTION} 1.0 nohost 0"
+
+
+@pytest.mark.parametrize("params", [[HALF_TURN, ONE_DEGREE], [ONE_DEGREE]])
+def test_another_number_of_beams_than_params_allow(tmp_path: Path, params: list[str]) -> None:
+    full, half = flaser(" ".join(["1.5"] * 180)), flaser(" ".join(["1.5"] * 90))
+    lines = [*params, *[full] * 40, *[half] * 20]
+    match = (
+        rf"log\.log:{len(params) + 41}: broken FLASER line \(90 readings, 1 degrees apart by the log's PARAM "
+        r"lines, do not cover 180 degrees; if they do, say so with data\.field_of_view_deg"
+    )
+    with pytest.raises(InputError, match=match):
+        load_lines(tmp_path, *lines)
+    stream = carmen.stream(tmp_path / "log.log")
+    assert [len(scan.ranges) for scan in stream.scans] == [180] * 40
+    assert stream.skipped == {"broken lines": 20}
+    # The user knows better.
+    sequence = load_lines(tmp_path, *lines, field_of_view_deg=180.0)
+    assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-90, 1))
+    assert first_and_spacing(sequence.read_scan(59)) == pytest.approx((-90, 2))
+
+
+def test_other_numbers_of_beams_that_params_do_not_deny(tmp_path: Path) -> None:
+    def spacings(*params: str, counts: tuple[int, ...]) -> list[float]:
+        lines = [flaser(" ".join(["1.5"] * count)) for count in counts]
+        sequence = load_lines(tmp_path, *params, *[lines[0]] * 3, *lines[1:])
+        notes = notes_of(sequence)
+        assert f"{len(counts) - 1} scans have another number of beams than {counts[0]}" in notes
+        scans = [sequence.read_scan(frame) for frame in range(2, len(sequence))]
+        return [first_and_spacing(scan)[1] for scan in scans]
+
+    assert spacings(counts=(180, 361, 90)) == pytest.approx([1, 0.5, 2])
+    assert spacings(HALF_TURN, counts=(180, 361, 90)) == pytest.approx([1, 0.5, 2])
+    assert spacings(HALF_TURN, ONE_DEGREE, counts=(180, 181)) == pytest.approx([1, 1])
+    # Two digits, of 0.352: 239.4 degrees are 682 or 683 times as much.
+    hokuyo = f"{FOV} 4.178319", f"{RESOLUTION} 0.35"
+    assert spacings(*hokuyo, counts=(682, 683)) == pytest.approx([239.4 / 682, 239.4 / 683], rel=1e-4)
+
+
 @pytest.mark.parametrize("params", [[f"{FOV} 4.712389"], [f"{RESOLUTION} 0.5"]])
 def test_an_option_stands_before_params_and_a_contradiction_is_told(
     tmp_path: Path, caplog: pytest.LogCaptureFixture, params: list[str]
@@ -459,6 +600,16 @@ def test_readings_stand_before_a_params_maximum(tmp_path: Path) -> None:
     for value in ("0", "-1", "nan", "none"):
         sequence = load_lines(tmp_path, f"PARAM robot_front_laser_max {value} nohost 0", line)
         assert np.isfinite(sequence.read_scan(0).ranges).all()
+
+
+def test_a_long_log_beyond_its_maximum_needs_no_more_memory(tmp_path: Path) -> None:
+    """Readings that all differ are counted in a few hundred kinds."""
+    rng = np.random.default_rng(0)
+    beyond = rng.uniform(10, 80, (200, 180))
+    path = write_log(tmp_path / "log.log", [flaser(" ".join(map(repr, row.tolist()))) for row in beyond])
+    positive, kinds = params._count_beyond(path, 10.0)
+    assert (positive, kinds.total()) == (beyond.size, beyond.size)
+    assert len(kinds) <= np.log(80 / 10) / params.ONE_READING + 1
 
 
 # Which file
@@ -533,6 +684,7 @@ def test_broken_line(tmp_path: Path, line: str, match: str) -> None:
         (flaser().encode("utf-16"), "is text in UTF-16; save it as UTF-8"),
         (flaser().encode("utf-16-le"), "is text in UTF-16; save it as UTF-8"),
         (flaser().encode("utf-16-be"), "is text in UTF-16; save it as UTF-8"),
+        (flaser().encode("utf-32"), "is text in UTF-32; save it as UTF-8"),
         (gzip.compress(flaser().encode("utf-16")), "is text in UTF-16; save it as UTF-8"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:1\nsize 9\n", "pointer of Git LFS"),
         (b"PK\x03\x04" + bytes(40), "is a zip archive; unpack it"),
@@ -579,6 +731,15 @@ def test_both_kinds_of_line(tmp_path: Path) -> None:
     ]
     with pytest.raises(InputError, match=r"log\.log:10: ROBOTLASER1 after FLASER lines"):
         load_lines(tmp_path, *lines)
+
+
+def test_a_log_of_one_scan_is_refused_with_what_to_do(tmp_path: Path) -> None:
+    log = load_lines(tmp_path, flaser())
+    drive = Drive("log", "", np.zeros((1, 181)), log.poses, log.stamps, FORWARD_CAMERA)
+    with pytest.raises(
+        InputError, match=r"log has 1 frames .*two are needed; give a longer recording or part"
+    ):
+        cut({"log": drive}, "log")
 
 
 @pytest.mark.parametrize("compress", PACKINGS)

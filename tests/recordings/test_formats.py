@@ -1,6 +1,8 @@
 """Formats by their names: the project's own, and one that another package adds by an entry point."""
 
+import os
 import sys
+from pathlib import Path
 
 import pytest
 
@@ -105,6 +107,20 @@ def test_an_added_format_without_a_part(add, source, says):
     with pytest.raises(InputError, match=says) as raised:
         all_formats()
     assert "\n" not in str(raised.value)
+
+
+def test_a_folder_of_ros1_bags_names_them(tmp_path):
+    for name in ("b.bag", "a.BAG", "notes.txt"):
+        (tmp_path / name).write_bytes(b"#ROSBAG V2.0\n")
+    with pytest.raises(InputError, match=r"give one of the bags in it: a\.BAG, b\.bag$"):
+        open_stream(tmp_path)
+
+
+def test_a_pipe_is_no_file(tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    for path in (tmp_path / "pipe", Path("/dev/null")):
+        with pytest.raises(InputError, match="is a pipe or device; give a file, or --live for JSON lines"):
+            open_stream(path)
 
 
 def test_two_formats_of_one_name(add):

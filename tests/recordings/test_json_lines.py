@@ -73,8 +73,9 @@ def test_json_lines() -> None:
         '{"points": 3}',
         '{"ranges": [1], "stamp": "noon"}',
         '{"ranges": [1], "stamp": [1]}',
-        '{"ranges": [1], "angle_min": 0}',
-        '{"ranges": [1], "angle_min": 0, "angle_increment": null, "angle_max": null}',
+        '{"ranges": [1, 2], "angle_min": 0}',
+        '{"ranges": [1, 2], "angle_min": 0, "angle_increment": null, "angle_max": null}',
+        '{"ranges": [1, 2], "angle_min": "NaN", "angle_increment": 1}',
         '{"ranges": [1], "angle_min": 0, "angle_max": "wide"}',
         '{"ranges": [1], "range_max": "far"}',
         '{"ranges": [1], "range_max": [8]}',
@@ -181,15 +182,121 @@ def test_other_messages_of_rosbridge_are_counted(caplog: pytest.LogCaptureFixtur
     assert [scan.ranges.tolist() for scan in stream.scans] == [[1, 2], [5, 6]]
     assert stream.skipped == {
         "other messages of rosbridge": 4,
-        "scans of another topic": 1,
+        "messages of /back": 1,
     }
     assert not caplog.messages
+
+
+def test_one_topic_of_rosbridge() -> None:
+    of = {name: {"op": "publish", "topic": name} for name in ("/odom", "/front", "back", "/sick")}
+    lines = [
+        of["/odom"] | {"msg": {"pose": [1, 2]}},
+        of["/front"] | {"msg": laser_scan(ranges=[1, 2])},
+        laser_scan(ranges=[7, 8]),
+        of["back"] | {"msg": laser_scan(ranges=[3, 4])},
+        of["/odom"] | {"msg": {"pose": [1, 2]}},
+        of["back"] | {"msg": laser_scan(ranges=[5, 6])},
+        of["/sick"] | {"msg": {"ranges": 5}},
+    ]
+    texts = [json.dumps(line) for line in lines]
+    for topic in ("back", "/back"):
+        stream = json_lines.stream_lines(texts, topic=topic)
+        assert [scan.ranges.tolist() for scan in stream.scans] == [[3, 4], [5, 6]]
+        assert stream.skipped == {
+            "messages of /odom": 2,
+            "messages of /front": 1,
+            "messages of /sick": 1,
+            "messages without a topic": 1,
+        }
+    # Without a topic the first that gives a scan; what is known to be of another one is not looked into.
+    stream = json_lines.stream_lines(texts)
+    assert [scan.ranges.tolist() for scan in stream.scans] == [[1, 2], [7, 8]]
+    assert stream.skipped == {
+        "lines that are no scan": 1,
+        "messages of back": 2,
+        "messages of /odom": 1,
+        "messages of /sick": 1,
+    }
+    only = (
+        "messages of /front, messages of /odom, messages of /sick, messages of back, messages without a topic"
+    )
+    with pytest.raises(InputError, match=f"no scan of topic /side in it, only {only}; choose one of these"):
+        list(json_lines.stream_lines(texts, topic="/side").scans)
+    broken = r"only lines that are no scan \(line 7: ranges is 5, no list\), messages of /front, "
+    with pytest.raises(InputError, match=f"no scan of topic sick in it, {broken}"):
+        list(json_lines.stream_lines(texts, topic="sick").scans)
+    with pytest.raises(InputError, match="/scan in it, only messages without a topic; leave --topic out"):
+        list(json_lines.stream_lines([GOOD], topic="/scan").scans)
+
+
+def test_one_topic_of_a_file(tmp_path: Path) -> None:
+    messages = {"/a\n": laser_scan(ranges=[1, 2]), "/b": laser_scan(ranges=[3, 4])}
+    lines = [json.dumps({"op": "publish", "topic": topic, "msg": m}) for topic, m in messages.items()]
+    (tmp_path / "log.jsonl").write_text("\n".join(lines))
+    stream = open_stream(tmp_path / "log.jsonl", {"topic": "b"})
+    assert [scan.ranges.tolist() for scan in stream.scans] == [[3, 4]]
+    assert stream.skipped == {r"messages of '/a\n'": 1}
+
+
+@pytest.mark.parametrize("angle", ["angle_increment", "angle_max"])
+@pytest.mark.parametrize("value", [-0.25, 0, "NaN"])
+def test_angles_without_a_first_one_are_not_dropped(angle: str, value: object) -> None:
+    with pytest.raises(InputError, match=f"line 1: {angle}, but no angle_min in it; "):
+        scan_of({"ranges": [1, 2], angle: value})
+    assert scan_of({"ranges": [1, 2], angle: None}).bearings is None
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"angle_min": None}, "angle_min is null, no number"),
+        ({"angle_increment": "wide"}, 'angle_increment is "wide", no number'),
+        ({"angle_max": []}, "angle_max is a list, no number"),
+        ({"stamp": "2020-01-01"}, 'stamp is "2020-01-01", no number'),
+        ({"stamp": True}, "stamp is true, no number"),
+        ({"header": {"stamp": "2020-01-01"}}, 'header.stamp is "2020-01-01", no number'),
+        ({"header": {"stamp": {"secs": "noon"}}}, 'seconds of header.stamp is "noon", no number'),
+        ({"stamp": {"sec": 1, "nanosec": {}}}, "nanoseconds of stamp is an object, no number"),
+        ({"range_max": "x"}, 'range_max is "x", no number'),
+        ({"range_min": "x" * 1000}, f'range_min is "{"x" * 39}..., no number'),
+        ({"time_increment": False}, "time_increment is false, no number"),
+        ({"ranges": ["one"]}, 'a reading is "one", no number'),
+        ({"ranges": None}, "ranges is null, no list"),
+        ({"ranges": None, "points": [[1, "y"]]}, 'a coordinate is "y", no number'),
+        ({"points": 3}, "points is 3, no list"),
+        ({"points": [[1]]}, r"points is no list of \[x, y\]"),
+    ],
+)
+def test_faults_are_told_by_field_and_value(changes: dict[str, object], says: str) -> None:
+    with pytest.raises(InputError, match=f"the first, line 1: {says}; ") as raised:
+        scan_of(laser_scan(**changes))
+    assert "\n" not in str(raised.value)
+
+
+@pytest.mark.parametrize(
+    ("line", "says"),
+    [
+        ("{]", "no JSON from its character 2 on"),
+        ("[1, 2]", "a list is no JSON object"),
+        ("null", "null is no JSON object"),
+        ('{"points": null}', "points is null, no list"),
+        ("{}", "neither a list of ranges nor of points in it"),
+        ("[" * 100_000, "no JSON with numbers of a usual length and lists of a usual depth"),
+    ],
+)
+def test_lines_of_something_else_are_told(line: str, says: str) -> None:
+    with pytest.raises(InputError, match=f"the first, line 1: {says}; "):
+        list(json_lines.stream_lines([line]).scans)
+
+
+def test_a_single_beam_needs_no_spacing() -> None:
+    np.testing.assert_array_equal(scan_of({"ranges": [1], "angle_min": 0.5}).bearings, [0.5])
 
 
 def test_a_source_without_a_scan_is_told_once(caplog: pytest.LogCaptureFixture) -> None:
     stream = json_lines.stream_lines(["", *['{"ranges": 5}'] * 120], "scans")
     with pytest.raises(
-        InputError, match=r"scans: none of its 120 lines is a scan; the first, line 2: neither"
+        InputError, match=r"scans: none of its 120 lines is a scan; the first, line 2: ranges is 5"
     ):
         list(stream.scans)
     assert len(caplog.messages) == 3
@@ -237,6 +344,24 @@ def test_a_file_of_something_else_in_json(tmp_path: Path) -> None:
         InputError, match=r"settings\.json: none of its 5 lines is a scan; .*; write one object"
     ):
         list(open_stream(path).scans)
+
+
+@pytest.mark.parametrize("compress", [None, "gz"])
+@pytest.mark.parametrize(
+    ("start", "between", "says"),
+    [
+        ("[", ",\n", "is a JSON list; write one object a line"),
+        ("\ufeff [\n  ", ",\n", "is a JSON list; write one object a line"),
+        ("\x1e", "\n\x1e", r"is a JSON text sequence \(RFC 7464\); write one object a line"),
+    ],
+)
+def test_lists_and_sequences_are_refused(
+    tmp_path: Path, compress: str | None, start: str, between: str, says: str
+) -> None:
+    content = (start + between.join([GOOD, GOOD])).encode()
+    (tmp_path / "scans.json").write_bytes(PACKINGS[compress](content) if compress else content)
+    with pytest.raises(InputError, match=rf"scans\.json: {says}"):
+        open_stream(tmp_path / "scans.json")
 
 
 def test_a_file_that_is_cut_off_gives_what_is_there(tmp_path: Path) -> None:

@@ -2,6 +2,7 @@
 
 import sqlite3
 from contextlib import closing
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -262,6 +263,58 @@ def test_a_stamp_of_0_is_the_time_of_arrival():
     assert rosbag.convert(scan, 12_500_000_000).stamp == 12.5
     scan = laser_scan(store, np.ones(3), 7.25, 180.0, False)
     assert rosbag.convert(scan, 12_500_000_000).stamp == 7.25
+
+
+@pytest.mark.parametrize("kind", FORMATS)
+@pytest.mark.parametrize(
+    ("headers", "stamps"),
+    [
+        ([0, 0, 0], [START + 1e-6, START + 0.100001, START + 0.200001]),
+        ([0, 5, 6], [START + 1e-6, START + 0.100001, START + 0.200001]),
+        ([5, 0, 6], [5, None, 6]),
+    ],
+)
+def test_one_clock_for_a_topic(tmp_path, kind, headers, stamps):
+    store, first = store_of(kind), kind == "ros1"
+    scans = [
+        ("/scan", arrival_of(n), laser_scan(store, RANGES[n], stamp, 180.0, first))
+        for n, stamp in enumerate(headers)
+    ]
+    points = {"x": np.ones(4, "f4"), "y": np.arange(4, dtype="f4"), "z": np.zeros(4, "f4")}
+    clouds = [
+        ("/points", arrival_of(n), point_cloud(store, points, stamp, first))
+        for n, stamp in enumerate(headers)
+    ]
+    bag = write_bag(tmp_path, kind, {"/scan": SCAN, "/points": CLOUD}, scans + clouds)
+    for topic in ("/scan", "/points"):
+        found = [scan.stamp for scan in read(bag, topic=topic)[1]]
+        assert [stamp is None for stamp in found] == [stamp is None for stamp in stamps]
+        # To 1e-6 of a second, at which a float of this size still counts.
+        assert found == [stamp and pytest.approx(stamp, rel=0, abs=1e-6) for stamp in stamps]
+
+
+def test_a_bag_is_called_as_its_folder(tmp_path, monkeypatch):
+    bag = make_bag(tmp_path, "sqlite3", RANGES)
+    [file] = bag.glob("*.db3")
+    assert (open_stream(bag).name, open_stream(file).name) == (bag.name, file.name)
+    monkeypatch.chdir(bag)
+    for path in ("metadata.yaml", ".", bag / "metadata.yaml"):
+        assert open_stream(Path(path)).name == bag.name
+
+
+def test_a_topic_with_a_slash_and_one_without(tmp_path):
+    channels = dict.fromkeys(("/scan", "scan", "/rear"), (SCAN, "ros2msg", b"", "cdr"))
+    messages = [(name, arrival_of(0), scan_bytes(row)) for name, row in zip(channels, RANGES, strict=False)]
+    path = write_mcap(tmp_path / "log.mcap", channels, messages)
+    for name, row in (("/scan", 0), ("scan", 1), ("/rear", 2), ("rear", 2)):
+        check_scans(read(path, topic=name)[1], RANGES[[row]])
+
+
+@pytest.mark.parametrize("encoding", ["", "CDR", "Cdr"])
+def test_names_of_the_encoding_cdr(tmp_path, encoding):
+    messages = [("/scan", arrival_of(n), scan_bytes(row)) for n, row in enumerate(RANGES)]
+    path = write_mcap(tmp_path / "log.mcap", {"/scan": (SCAN, "ros2msg", b"", encoding)}, messages)
+    check_scans(read(path)[1], RANGES)
 
 
 def case(name):

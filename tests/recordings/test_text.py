@@ -1,4 +1,4 @@
-"""Text files with a byte order mark, or in UTF-16."""
+"""Text files with a byte order mark, or in UTF-16 or UTF-32."""
 
 from pathlib import Path
 
@@ -27,6 +27,16 @@ def test_utf16_is_refused(tmp_path: Path, encoding: str) -> None:
     path.write_text("\n".join(POSES), encoding=encoding)
     for read in (read_kitti, need_text):
         with pytest.raises(InputError, match=r"poses\.txt: is text in UTF-16; save it as UTF-8"):
+            read(path)
+
+
+@pytest.mark.parametrize("mark", ["", "\ufeff"])
+@pytest.mark.parametrize("encoding", ["utf-32-le", "utf-32-be"])
+def test_utf32_is_refused_by_its_name(tmp_path: Path, encoding: str, mark: str) -> None:
+    path = tmp_path / "poses.txt"
+    path.write_text(mark + "\n".join(POSES), encoding=encoding)
+    for read in (read_kitti, need_text):
+        with pytest.raises(InputError, match=r"poses\.txt: is text in UTF-32; save it as UTF-8"):
             read(path)
 
 

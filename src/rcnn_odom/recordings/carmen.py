@@ -24,7 +24,7 @@ from rcnn_odom.recordings.text import lines_of, need_text
 
 log = logging.getLogger(__name__)
 
-READER_VERSION = 2
+READER_VERSION = 3
 """Raised whenever the same file would give other scans."""
 
 SUFFIXES = tuple(
@@ -72,7 +72,7 @@ def load(
     else:
         poses, about_truth = read_truth(find_reference(Path(reference), name), len(lines))
     notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
-    notes += [*front.notes, *([front.contradiction] if front.contradiction else [])]
+    notes += [*_count_doubted(lines), *front.notes, *front.warnings]
     notes += [*_check_stamps(beams.stamps), *about_truth]
     status = path.stat()
     key = f"carmen {READER_VERSION} {path.name} {status.st_size} {status.st_mtime_ns} {front.laser!r}"
@@ -109,8 +109,8 @@ def stream(path: Path, field_of_view_deg: float | None = None) -> ScanStream:
     check_field_of_view(field_of_view_deg)
     _need_log(path)
     front = find_front_laser(path, field_of_view_deg)
-    if front.contradiction:
-        log.warning("%s: %s", path, front.contradiction)
+    for warning in front.warnings:
+        log.warning("%s: %s", path, warning)
     skipped: Counter[str] = Counter()
     lines = _laser_lines(path, front.laser, skipped, strict=False)
     scans = (Beams.of([line])(0) for line in lines)
@@ -247,6 +247,11 @@ def _count_scans(lines: list[LaserLine], other_lasers: Counter[str]) -> list[str
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(other_lasers.items()))
         notes.append(f"lines of other lasers passed over: {counts}")
     return notes
+
+
+def _count_doubted(lines: list[LaserLine]) -> list[str]:
+    doubted = sum(line.is_maximum_doubted for line in lines)
+    return [f"{doubted} lines' maximum is not believed: most readings lie beyond it"] if doubted else []
 
 
 def _count_no_returns(beams: Beams, max_range: float | None) -> str:

@@ -90,19 +90,24 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
 
     Args:
         path: of it.
-        options: ``topic`` of a bag, ``ring`` of a KITTI drive or of a point cloud, ``height`` of a point
-            cloud, ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left out; one that the
-            format does not have is told and left out.
+        options: ``topic`` of a bag or of rosbridge's messages, ``ring`` of a KITTI drive or of a point cloud,
+            ``height`` of a point cloud, ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left
+            out; one that the format does not have is told and left out.
 
     Raises:
         InputError: nothing of the kind, or it cannot be read.
     """
     if not path.exists():
         raise InputError(f"{path}: no such file or folder; give a KITTI sequence, a CARMEN log or a ROS bag")
+    if not path.is_file() and not path.is_dir():
+        raise InputError(f"{path}: is a pipe or device; give a file, or --live for JSON lines")
     for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, ASKED_LAST)):
         if hasattr(found, "recognises") and found.recognises(path):
             stream: ScanStream = found.stream(path, **_options_for(found, path, options or {}))
             return stream
+    bags = sorted(file.name for file in path.iterdir() if file.suffix.lower() == ".bag")
+    if bags:
+        raise InputError(f"{path}: a folder of ROS 1 bags; give one of the bags in it: {', '.join(bags)}")
     raise InputError(
         f"{path}: neither a KITTI sequence (no velodyne/ or velodyne_points/ in it; name sequences/05) nor a "
         "ROS 2 bag (no metadata.yaml, .db3 or .mcap in it); give one of them"

@@ -1,47 +1,60 @@
 """ROS's message LaserScan, from a bag, a live node or rosbridge, as a scan."""
 
+import math
+
 import numpy as np
 import numpy.typing as npt
 
+from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.scan import Scan
+
+NO_RETURN_CODE = 0.98
+"""Of the largest reading: what lies above is at the constant that a laser writes where nothing came back."""
 
 
 def from_laser_scan(
     ranges: npt.ArrayLike,
     angle_min: float,
     angle_increment: float,
+    angle_max: float = math.nan,
     range_min: float = 0.0,
-    range_max: float = float("inf"),
+    range_max: float = math.inf,
     time_increment: float = 0.0,
     stamp: float | None = None,
     frame_id: str = "",
 ) -> Scan:
     """The scan of a LaserScan message, whose angles count as ours do (REP 103).
 
-    Some drivers leave a limit at 0 or write nan: a limit that no laser can have limits nothing.
+    Some drivers leave a limit at 0 or write nan: a limit that no laser can have limits nothing. Nor does a
+    maximum that most readings contradict.
 
     Args:
         ranges: (P,) metres; nan, and below ``range_min`` no return (REP 117).
         angle_min, angle_increment: radians, of the first beam and from one beam to the next; a negative
             increment is a laser that turns clockwise.
+        angle_max: radians, of the last beam; where the increment is 0 or nan, the beams are even up to it.
         range_min, range_max: metres. At ``range_max`` or beyond it a reading is no return, and infinite here.
             A maximum that is nan or not above the minimum is unknown.
         time_increment: seconds from one beam to the next; not positive: unknown.
         stamp: seconds; None where there is no clock.
         frame_id: name of the laser's frame.
 
+    Raises:
+        ValueError: the angles do not say where the beams lie.
+
     >>> from_laser_scan([1.0, 9.0, 0.0], 0.0, 0.5, range_max=8.0).ranges
     array([ 1., inf,  0.])
     """
-    values = np.array(ranges, dtype=np.float64)
-    beam = np.arange(len(values), dtype=np.float64)
-    if range_max > max(range_min, 0.0):  # not so of nan
+    with np.errstate(over="ignore", invalid="ignore"):  # encoders leave out bearings that are no numbers
+        values = np.array(ranges, dtype=np.float64)
+        beam = np.arange(len(values), dtype=np.float64)
+        bearings = angle_min + _spacing(angle_min, angle_increment, angle_max, len(values)) * beam
+    # Comparisons with nan are false.
+    if range_max > max(range_min, 0.0) and not has_most_beyond(values, range_max):
         values[values >= range_max] = np.inf
     if 0.0 < range_min < np.inf:
         values[values < range_min] = 0.0
     values[np.isnan(values)] = 0.0
-    with np.errstate(over="ignore", invalid="ignore"):  # encoders leave out bearings that are no numbers
-        bearings = angle_min + angle_increment * beam
     return Scan(
         ranges=values,
         bearings=bearings,
@@ -49,3 +62,25 @@ def from_laser_scan(
         stamp=stamp,
         frame_id=frame_id,
     )
+
+
+def has_most_beyond(ranges: FloatArray, limit: float) -> bool:
+    """Whether more than half of the readings (P,) are beyond a limit in metres.
+
+    Readings at the largest one do not count, on either side: lasers write it where nothing came back.
+    """
+    given = ranges[(ranges > 0) & np.isfinite(ranges)]
+    measured = given[given < NO_RETURN_CODE * given.max(initial=0.0)]
+    return bool(np.count_nonzero(measured > limit) > len(measured) / 2)
+
+
+def _spacing(angle_min: float, angle_increment: float, angle_max: float, count: int) -> float:
+    """Radians from beam to beam; some drivers leave it out, and the last beam's angle tells it."""
+    if not math.isfinite(angle_min):
+        raise ValueError(f"its angle_min is {angle_min}")
+    if count < 2 or (math.isfinite(angle_increment) and angle_increment != 0):
+        return angle_increment if math.isfinite(angle_increment) else 0.0
+    extent = angle_max - angle_min
+    if not math.isfinite(extent) or extent == 0:
+        raise ValueError(f"its angle_increment is {angle_increment:g} and its angle_max {angle_max:g}")
+    return extent / (count - 1)

@@ -50,7 +50,10 @@ def cut(drives: Mapping[str, Drive], name: str) -> Drive:
     part = whole.part(round(start * len(whole)), round(stop * len(whole)), name)
     known = np.flatnonzero(np.isfinite(part.poses).all((1, 2)))
     if len(known) < 2:
-        raise InputError(f"sequence {name} has {len(known)} frames with known poses; two are needed")
+        raise InputError(
+            f"sequence {name} has {len(known)} frames with known poses, but two are needed; give a longer "
+            "recording or part, or a truth that knows more of it"
+        )
     first, last = int(known[0]), int(known[-1])
     if len(known) != last - first + 1:
         gap = int(np.flatnonzero(np.diff(known) > 1)[0])

@@ -6,6 +6,7 @@ what a bag says about other topics, or about its types, cannot keep it from bein
 
 from collections import Counter
 from collections.abc import Callable, Iterator
+from dataclasses import replace
 from functools import cache
 from itertools import islice
 from pathlib import Path
@@ -15,7 +16,7 @@ import numpy as np
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.bags.chunks import BrokenBag
-from rcnn_odom.recordings.bags.files import MENDED_BY, Bag, is_bag, open_bag
+from rcnn_odom.recordings.bags.files import MENDED_BY, METADATA, Bag, is_bag, open_bag
 from rcnn_odom.recordings.bags.point_cloud import PLANE, Cloud, choose_cut, estimate_beams, read_cloud
 from rcnn_odom.recordings.bags.topics import LASER_SCAN, Topic, choose_topic, short_name
 from rcnn_odom.recordings.laser_scan import from_laser_scan
@@ -44,8 +45,8 @@ def stream(
 ) -> ScanStream:
     """The scans of a bag, in the order of their arrival.
 
-    The stamp is the header's, or where that is 0 the time of arrival. A message that cannot be read is
-    skipped and counted.
+    The stamp is the header's, or where the first one's is 0 the time of arrival. A message that cannot
+    be read is skipped and counted.
 
     Args:
         path: a file of a bag, packed or not; the folder of a ROS 2 bag, or the metadata.yaml in it.
@@ -80,34 +81,36 @@ def convert(message: Any, arrival: int = 0) -> Scan:
     """
     return from_laser_scan(
         message.ranges,
-        message.angle_min,
-        _angle_increment(message),
+        float(message.angle_min),
+        float(message.angle_increment),
+        float(message.angle_max),
         message.range_min,
         message.range_max,
         message.time_increment,
-        _stamp(message, arrival),
+        _header_stamp(message) or 1e-9 * arrival,
         message.header.frame_id,
     )
 
 
-def _angle_increment(message: Any) -> float:
-    """Radians from beam to beam; some drivers leave it out, and the last beam's angle tells it."""
-    increment, gaps = float(message.angle_increment), len(message.ranges) - 1
-    if not np.isfinite(message.angle_min):
-        raise ValueError(f"its angle_min is {message.angle_min}")
-    if np.isfinite(increment) and increment != 0:
-        return increment
-    if gaps < 1:
-        return 0.0
-    extent = float(message.angle_max) - float(message.angle_min)
-    if not np.isfinite(extent) or extent == 0:
-        raise ValueError(f"its angle_increment is {increment:g} and its angle_max {message.angle_max:g}")
-    return extent / gaps
+def _header_stamp(message: Any) -> float:
+    return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
 
 
-def _stamp(message: Any, arrival: int) -> float:
-    stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
-    return float(stamp or 1e-9 * arrival)
+class _Clock:
+    """The stamps of a topic: of the headers, or the times of arrival where the first header has none.
+
+    The two are not mixed, since they may be of clocks that know nothing of each other.
+    """
+
+    def __init__(self) -> None:
+        self._has_headers: bool | None = None
+
+    def stamp(self, message: Any, arrival: int) -> float | None:
+        """Seconds; None where the header of a single message has no time."""
+        stamp = _header_stamp(message)
+        if self._has_headers is None:
+            self._has_headers = stamp != 0
+        return (stamp or None) if self._has_headers else 1e-9 * arrival
 
 
 def _stream_lasers(
@@ -119,12 +122,16 @@ def _stream_lasers(
             f"{path}: {topic.name} holds LaserScan messages, of which there is no {given} to choose; leave "
             f"--{given} out, or choose a topic with PointCloud2 messages with --topic"
         )
-    skipped: Counter[str] = Counter()
+    skipped, clock = Counter[str](), _Clock()
+
+    def to_scan(message: Any, arrival: int) -> Scan:
+        return replace(convert(message), stamp=clock.stamp(message, arrival))
+
     return ScanStream(
-        name=path.name,
-        scans=_close_after(bag, _read(path, bag, topic, convert, skipped)),
+        name=_name_of(path),
+        scans=_close_after(bag, _read(path, bag, topic, to_scan, skipped)),
         total=topic.messages,
-        notes=(f"{topic.messages} scans of {topic.name}",),
+        notes=(f"{topic.messages} scans of {topic.name}", *bag.notes),
         skipped=skipped,
     )
 
@@ -138,20 +145,27 @@ def _stream_clouds(
     except ValueError as error:
         raise InputError(f"{path}: {topic.name} cannot be cut to a planar scan: {error}") from error
 
+    skipped, clock = Counter[str](), _Clock()
+
     def to_scan(message: Any, arrival: int) -> Scan:
         points = cut(read_cloud(message))
-        return Scan.from_points(points, _stamp(message, arrival), message.header.frame_id)
+        return Scan.from_points(points, clock.stamp(message, arrival), message.header.frame_id)
 
-    skipped: Counter[str] = Counter()
     is_ring = height is None and any(np.ptp(cloud.points[:, 2]) > PLANE for cloud in clouds)
     return ScanStream(
-        name=path.name,
+        name=_name_of(path),
         scans=_close_after(bag, _read(path, bag, topic, to_scan, skipped)),
         total=topic.messages,
         beams=estimate_beams(clouds, cut) if is_ring else None,
-        notes=(f"{topic.messages} point clouds of {topic.name}", about),
+        notes=(f"{topic.messages} point clouds of {topic.name}", about, *bag.notes),
         skipped=skipped,
     )
+
+
+def _name_of(path: Path) -> str:
+    """Of a bag as a user knows it: of its folder where the path is its metadata.yaml."""
+    whole = path.resolve()
+    return (whole.parent if whole.name == METADATA else whole).name
 
 
 def _sample_clouds(path: Path, bag: Bag, topic: Topic) -> list[Cloud]:

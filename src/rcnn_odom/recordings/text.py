@@ -16,7 +16,7 @@ def need_text(path: Path) -> bytes:
     """The first bytes of a text file, unpacked and without a byte order mark.
 
     Raises:
-        InputError: it cannot be read or unpacked, is empty, or is text in UTF-16.
+        InputError: it cannot be read or unpacked, is empty, or is text in UTF-16 or UTF-32.
     """
     head = read_head(path)
     refuse_utf16(path, head)
@@ -27,13 +27,18 @@ def need_text(path: Path) -> bytes:
 
 
 def refuse_utf16(path: str | Path, head: bytes) -> None:
-    """Refuses a text in UTF-16, of which a reader of UTF-8 understands no word.
+    """Refuses a text in UTF-16 or UTF-32, of which a reader of UTF-8 understands no word.
 
     Raises:
         InputError: the first bytes of the file are such a text.
     """
     marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and b"\0" in head
     every_other_is_zero = any(head) and (not any(head[::2]) or not any(head[1::2]))
+    # The mark of UTF-16 also begins that of UTF-32, whose letters leave two bytes in the middle at zero.
+    if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)) or (
+        len(head) > 3 and any(head) and not any(head[1::4] + head[2::4])
+    ):
+        raise InputError(f"{path}: is text in UTF-32; save it as UTF-8")
     if marked or (len(head) > 3 and every_other_is_zero):
         raise InputError(f"{path}: is text in UTF-16; save it as UTF-8")
 

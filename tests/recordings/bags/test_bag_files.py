@@ -6,7 +6,9 @@ import lzma
 import shutil
 import sqlite3
 import tempfile
+from contextlib import closing
 
+import lz4.frame
 import numpy as np
 import pytest
 from backports import zstd
@@ -29,7 +31,7 @@ from data.make_bag import (
 from data.make_carmen import make_carmen
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings import rosbag
-from rcnn_odom.recordings.bags.chunks import BrokenBag, in_order
+from rcnn_odom.recordings.bags.chunks import BrokenBag, _unpack, in_order
 from rcnn_odom.recordings.formats import open_stream
 
 RANGES = np.random.default_rng(0).uniform(1, 39, (40, 181))
@@ -168,6 +170,89 @@ def test_a_bag_of_several_files(tmp_path, kind):
     check(bag)
 
 
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("packing", ["zst", "zstd"])
+def test_a_file_and_its_packed_twin_are_read_once(tmp_path, kind, packing):
+    bag = make_split(tmp_path, kind)
+    for path in list(bag.iterdir()):
+        (bag / f"{path.name}.{packing}").write_bytes(zstd.compress(path.read_bytes()))
+    check(bag)
+    next(bag.glob("split_1.*[!dt]")).unlink()
+    check(bag)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+def test_the_files_that_are_read_are_told(tmp_path, kind):
+    bag = make_split(tmp_path, kind)
+    suffix = next(bag.iterdir()).suffix
+    names = ", ".join(f"split_{number}{suffix}" for number in (0, 1, 2, 10))
+    assert open_stream(bag).notes == ("40 scans of /scan", f"4 files: {names}")
+    (bag / "metadata.yaml").write_bytes(b"\xff garbage")
+    garbage = f"metadata.yaml names no files that can be read; what is there is read: {names}"
+    assert open_stream(bag).notes == ("40 scans of /scan", garbage)
+    write_metadata(bag, [f"split_2{suffix}"])
+    assert open_stream(bag).notes == ("10 scans of /scan",)
+
+
+@pytest.mark.parametrize("kind", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("size", [0, 10, 100, 300])
+@pytest.mark.parametrize("number", [0, 1, 10])
+def test_a_file_of_a_split_bag_that_was_hardly_begun(tmp_path, kind, size, number):
+    bag = make_split(tmp_path, kind)
+    [tiny] = bag.glob(f"split_{number}.*")
+    tiny.write_bytes(tiny.read_bytes()[:size])
+    place = (0, 1, 2, 10).index(number)
+    kept = np.delete(RANGES, np.arange(10 * place, 10 * place + 10), axis=0)
+    stream, scans = open_stream(bag), []
+    assert stream.total == 30
+    with pytest.raises(InputError, match=rf"breaks off after 30 scans \({tiny.name}: .*\); .*reindex"):
+        scans.extend(stream.scans)
+    np.testing.assert_allclose([scan.ranges for scan in scans], kept, rtol=1e-6)
+    for path in bag.iterdir():
+        path.write_bytes(path.read_bytes()[: min(size, 10)])
+    with pytest.raises(InputError, match=r"split_0\.\w+: (is empty|is named like|cannot be opened)"):
+        open_stream(bag)
+
+
+def test_what_comes_after_the_end_of_mcap_is_not_dropped_in_silence(tmp_path):
+    path = write_mcap(tmp_path / "log.mcap", SCAN_CHANNEL, MESSAGES)
+    whole = path.read_bytes()
+    for rest, says in (
+        (whole, "something follows after its end"),
+        (b"\0", "something follows after its end"),
+        (None, "it ends within a record"),
+    ):
+        path.write_bytes(whole[:-3] if rest is None else whole + rest)
+        stream, scans = open_stream(path), []
+        with pytest.raises(InputError, match=f"breaks off after 40 scans .{says}"):
+            scans.extend(stream.scans)
+        np.testing.assert_allclose([scan.ranges for scan in scans], RANGES, rtol=1e-6)
+    path.write_bytes(whole[:-8] + b"12345678")
+    with pytest.raises(InputError, match=r"breaks off after 40 scans .a record of it is damaged"):
+        read(path)
+
+
+@pytest.mark.parametrize("packing", ["zstd", "bz2", "lz4"])
+def test_a_chunk_of_several_frames(packing):
+    compress = {"zstd": zstd.compress, "bz2": bz2.compress, "lz4": lz4.frame.compress}[packing]
+    content = np.random.default_rng(3).bytes(5000)
+    frames = b"".join(compress(content[at : at + 1000]) for at in range(0, 5000, 1000))
+    assert _unpack(frames, packing) == content
+    assert content.startswith(_unpack(frames[:-100], packing))
+
+
+@pytest.mark.parametrize("name", ["x.db3", "browser history"])
+@pytest.mark.parametrize("table", ["sites (id INTEGER)", "topics (id INTEGER)"])
+def test_another_database_is_no_bag(tmp_path, name, table):
+    with closing(sqlite3.connect(tmp_path / name)) as database, database:
+        database.execute(f"CREATE TABLE {table}")
+    with pytest.raises(
+        InputError, match=r"is a database of sqlite3, but no ROS bag \(no such .*; give"
+    ) as told:
+        open_stream(tmp_path / name)
+    assert "reindex" not in str(told.value)
+
+
 def test_a_folder_with_metadata_alone(tmp_path):
     (tmp_path / "metadata.yaml").write_text("a: 1")
     with pytest.raises(InputError, match=r"no \.db3 or \.mcap file beside metadata\.yaml; "):
@@ -293,7 +378,7 @@ def test_every_whole_message_before_a_cut_is_given(tmp_path, kind):
         messages = [(0, arrival_of(number), content) for number, content in enumerate(contents)]
         write_ros1(path, connections, messages, index=kind == "ros1")
     whole = path.read_bytes()
-    for cut in range(50, len(whole) - 37, 13):  # in the last 37 bytes of mcap nothing is told
+    for cut in range(50, len(whole), 13):
         cut_off.write_bytes(whole[:cut])
         scans = []
         with pytest.raises(InputError, match=r"breaks off|cannot be opened"):

@@ -27,6 +27,10 @@ class BrokenBag(Exception):
     """A file of a bag is damaged or ends too early; what came before was given. Says why, in words."""
 
 
+class NoBag(Exception):
+    """A file is whole, but of something else. Says of what, in words."""
+
+
 class Connection(NamedTuple):
     """Who writes the messages of a topic.
 
@@ -208,11 +212,15 @@ def _unpack(content: bytes, packing: str) -> bytes:
     unpackers, errors = _unpackers()
     if packing not in unpackers:
         raise BrokenBag(f"its chunks are packed by {packing!r}, which is not known here")
+    unpacked = []
     try:
-        unpacked: bytes = unpackers[packing]().decompress(content)
+        while content:  # which may be of several frames
+            unpacker = unpackers[packing]()
+            unpacked.append(unpacker.decompress(content))
+            content = unpacker.unused_data or b""
     except errors as error:
         raise BrokenBag(f"a chunk of it cannot be unpacked by {packing}") from error
-    return unpacked
+    return b"".join(unpacked)
 
 
 def _unpackers() -> tuple[dict[str, Callable[[], Any]], tuple[type[Exception], ...]]:

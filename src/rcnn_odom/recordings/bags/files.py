@@ -5,10 +5,10 @@ from collections import Counter, defaultdict
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeAlias
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.recordings.bags.chunks import BrokenBag, ChunkedFile
+from rcnn_odom.recordings.bags.chunks import BrokenBag, ChunkedFile, NoBag
 from rcnn_odom.recordings.bags.mcap import MAGIC, McapFile
 from rcnn_odom.recordings.bags.ros1 import Ros1File
 from rcnn_odom.recordings.bags.sqlite import SqliteFile
@@ -23,7 +23,8 @@ FURTHER_SUFFIXES = (".active", ".gz", ".bz2", ".xz", ".zst", ".zstd")
 """What may come after them."""
 ROS1 = b"#ROSBAG V2"
 OLD_ROS1 = (b"#ROSBAG V1", b"#ROSRECORD V1")
-KINDS: dict[bytes, Callable[[Path], ChunkedFile | SqliteFile]] = {
+BagFile: TypeAlias = ChunkedFile | SqliteFile
+KINDS: dict[bytes, Callable[[Path], BagFile]] = {
     ROS1: Ros1File,
     MAGIC: McapFile,
     b"SQLite format 3\0": SqliteFile,
@@ -53,37 +54,57 @@ class Bag:
     """The files of a bag, one after the other.
 
     Args:
-        files: in their order.
+        files: in their order, each with its name.
         unpacked: removes what was unpacked for them.
+        faults: of files that cannot be opened, in words.
+        notes: what a user should know of the files.
 
     Attributes:
         topics: by name, the number of messages of each type.
-        broken: why one of the files ends too early; empty where none does.
+        broken: what is wrong with files that end too early or cannot be opened; empty where none does.
     """
 
-    def __init__(self, files: list[ChunkedFile | SqliteFile], unpacked: ExitStack) -> None:
-        self._files, self._unpacked = files, unpacked
+    def __init__(
+        self,
+        files: list[tuple[str, BagFile]],
+        unpacked: ExitStack,
+        faults: tuple[str, ...] = (),
+        notes: tuple[str, ...] = (),
+    ) -> None:
+        self._files, self._unpacked, self._faults, self.notes = files, unpacked, faults, notes
         self.topics: dict[str, Counter[str]] = defaultdict(Counter)
-        for file in files:
+        for _, file in files:
             for number, connection in file.connections.items():
                 self.topics[connection.topic][connection.kind] += file.counts[number]
-        self.broken = next((file.broken for file in files if file.broken), "")
+        broken = (self._name_fault(name, file.broken) for name, file in files if file.broken)
+        self.broken = ", ".join((*broken, *faults))
 
     def encodings(self, topic: str, kind: str) -> set[str]:
         """Of the messages of a topic that are of a type."""
-        connections = [c for file in self._files for c in file.connections.values()]
+        connections = [c for _, file in self._files for c in file.connections.values()]
         return {c.encoding for c in connections if (c.topic, c.kind) == (topic, kind)}
 
     def messages(self, topic: str, kind: str) -> Iterator[RawMessage]:
         """The messages of a topic that are of a type, those of each file in the order of their arrival.
 
         Raises:
-            BrokenBag: a file is damaged; after the last message before.
+            BrokenBag: a file is damaged or cannot be opened; after the last message that can be read, also of
+                the files that come after it.
         """
-        for file in self._files:
+        faults = list(self._faults)
+        for name, file in self._files:
             wanted = {n for n, c in file.connections.items() if (c.topic, c.kind) == (topic, kind)}
-            for arrival, number, content in file.messages(wanted):
-                yield RawMessage(file.connections[number].encoding, arrival, content)
+            try:
+                for arrival, number, content in file.messages(wanted):
+                    yield RawMessage(file.connections[number].encoding, arrival, content)
+            except BrokenBag as error:
+                faults.append(self._name_fault(name, str(error)))
+        if faults:
+            raise BrokenBag(", ".join(faults))
+
+    def _name_fault(self, name: str, fault: str) -> str:
+        is_one_of_several = len(self._files) + len(self._faults) > 1
+        return f"{name}: {fault}" if is_one_of_several else fault
 
     def close(self) -> None:
         """Removes what was unpacked."""
@@ -105,21 +126,37 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path) -> Bag:
-    """Opens all files of a bag.
+    """Opens all files of a bag; of several, those that can be opened.
 
     Args:
         path: of a file, packed or not; of the folder of a ROS 2 bag, or of the metadata.yaml in it.
 
     Raises:
-        InputError: a file is missing, no bag, or so damaged that nothing in it can be read.
+        InputError: a file is missing, no bag, or all are so damaged that nothing in them can be read.
     """
+    paths, notes = files_of(path)
+    files: list[tuple[str, BagFile]] = []
+    errors: dict[Path, InputError] = {}
     with ExitStack() as stack:
-        files = [_open_file(file, stack) for file in files_of(path)]
-        return Bag(files, stack.pop_all())
+        for each in paths:
+            try:
+                files.append((each.name, _open_file(each, stack)))
+            except InputError as error:  # a recorder that crashed leaves its last file empty
+                errors[each] = error
+        if not files:
+            raise errors[paths[0]]
+        faults = tuple(f"{each.name}: {_fault(each, error)}" for each, error in errors.items())
+        left_out = tuple(f"left out: {fault}" for fault in faults)
+        return Bag(files, stack.pop_all(), faults, (*notes, *left_out))
 
 
-def files_of(path: Path) -> list[Path]:
-    """The files of a bag in their order.
+def _fault(path: Path, error: InputError) -> str:
+    """What is wrong, without the file's path and the advice."""
+    return str(error).removeprefix(f"{path}: ").partition("; ")[0]
+
+
+def files_of(path: Path) -> tuple[list[Path], tuple[str, ...]]:
+    """The files of a bag in their order, and a note where it is not plain which these are.
 
     A folder's are those that its metadata.yaml names; where that is missing or cannot be read, all that are
     there, in the order of the numbers in their names.
@@ -130,12 +167,16 @@ def files_of(path: Path) -> list[Path]:
     if path.name == METADATA and path.is_file():
         path = path.absolute().parent
     if path.is_file():
-        return [path]
-    named = _named_files(path / METADATA)
+        return [path], ()
+    metadata = path / METADATA
+    named = _named_files(metadata)
     found = [_find(path, name) for name in named] or _storage_files(path)
     if not found:
         raise InputError(f"{path}: no .db3 or .mcap file beside {METADATA}; copy the files of the bag too")
-    return found
+    listed = ", ".join(file.name for file in found)
+    if metadata.exists() and not named:
+        return found, (f"{METADATA} names no files that can be read; what is there is read: {listed}",)
+    return found, (f"{len(found)} files: {listed}",) if len(found) > 1 else ()
 
 
 def _is_named_like_bag(path: Path) -> bool:
@@ -151,7 +192,13 @@ def _storage_files(folder: Path) -> list[Path]:
         return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
     wanted = re.compile(r".*\.(db3|mcap)(\.zstd?)?", re.IGNORECASE)
-    return sorted((p for p in folder.iterdir() if wanted.fullmatch(p.name) and p.is_file()), key=natural)
+    found = {path for path in folder.iterdir() if wanted.fullmatch(path.name) and path.is_file()}
+    # What was unpacked beside its packed file is not read twice.
+    return sorted((path for path in found if not _is_packed_twin(path, found)), key=natural)
+
+
+def _is_packed_twin(path: Path, found: set[Path]) -> bool:
+    return path.suffix.lower() in (".zst", ".zstd") and path.with_suffix("") in found
 
 
 def _named_files(metadata: Path) -> list[str]:
@@ -180,7 +227,7 @@ def _find(folder: Path, name: str) -> Path:
     return found
 
 
-def _open_file(path: Path, stack: ExitStack) -> ChunkedFile | SqliteFile:
+def _open_file(path: Path, stack: ExitStack) -> BagFile:
     head = read_head(path)
     if not head:
         raise InputError(f"{path}: is empty; {MENDED_BY}, but here is nothing, so copy or record it again")
@@ -198,6 +245,8 @@ def _open_file(path: Path, stack: ExitStack) -> ChunkedFile | SqliteFile:
     unpacked = stack.enter_context(unpacked_file(path))
     try:
         file = kind(unpacked)
+    except NoBag as error:
+        raise InputError(f"{path}: {error}; give the bag itself") from error
     except (BrokenBag, OSError) as error:
         raise InputError(f"{path}: cannot be opened as a ROS bag ({error}); {MENDED_BY}") from error
     if file.broken and not file.connections:

@@ -42,6 +42,7 @@ class McapFile(ChunkedFile):
             kind, length = HEAD.unpack(read_exactly(file, HEAD.size))
             end = position + HEAD.size + length
             if kind == FOOTER:
+                _need_end(file, end)
                 return
             if kind == 0:  # what a computer leaves that lost its power
                 raise BrokenBag(DAMAGED)
@@ -103,7 +104,17 @@ class McapFile(ChunkedFile):
             encoding, _ = _text(record, after)
         except struct.error:
             return
+        encoding = (encoding or "cdr").lower()
         self.connections[number] = Connection(topic, self._kinds.get(schema, ""), encoding)
+
+
+def _need_end(file: BinaryIO, position: int) -> None:
+    """Raises BrokenBag where anything but the end follows after the footer, as in files put together."""
+    file.seek(position)
+    if read_exactly(file, len(MAGIC)) != MAGIC:
+        raise BrokenBag(DAMAGED)
+    if file.read(1):
+        raise BrokenBag("something follows after its end, as where files were put together")
 
 
 def _text(record: memoryview, position: int) -> tuple[str, int]:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import closing, suppress
 from pathlib import Path
 
-from rcnn_odom.recordings.bags.chunks import BrokenBag, Connection, Message, message_type
+from rcnn_odom.recordings.bags.chunks import BrokenBag, Connection, Message, NoBag, message_type
 
 MESSAGES = "SELECT CAST(timestamp AS INTEGER), topic_id, data FROM messages"
 
@@ -16,6 +16,7 @@ class SqliteFile:
 
     Raises:
         BrokenBag: it cannot be opened.
+        NoBag: it is another database.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,6 +33,8 @@ class SqliteFile:
                 }
                 self._count(database)
         except sqlite3.Error as error:
+            if not self.broken and str(error).startswith("no such "):  # table, or column of it
+                raise NoBag(f"is a database of sqlite3, but no ROS bag ({error})") from error
             raise BrokenBag(str(error)) from error
 
     def messages(self, wanted: set[int]) -> Iterator[Message]:

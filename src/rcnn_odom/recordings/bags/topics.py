@@ -39,7 +39,8 @@ def choose_topic(path: Path, bag: Bag, wanted: str | None) -> Topic:
     lasers = [topic for topic in topics if topic.kind == LASER_SCAN]
     clouds = [topic for topic in topics if topic.kind == POINT_CLOUD]
     if wanted is not None:
-        found = [topic for topic in lasers + clouds if _is_called(topic, wanted)][:1]
+        found = [topic for topic in lasers + clouds if _is_called(topic, wanted)]
+        found = sorted(found, key=lambda topic: topic.name != wanted)[:1]
     else:
         written = [[topic for topic in some if topic.messages] for some in (lasers, clouds)]
         found = written[0] or written[1] or lasers or clouds

@@ -19,11 +19,13 @@ class FrontLaser(NamedTuple):
         field_of_view: radians.
         resolution: radians from beam to beam, 0 where unknown.
         maximum: metres; readings at or beyond it are no returns.
+        rounding: radians that the resolution may be off; infinite where a user's field of view counts more.
     """
 
     field_of_view: float = math.pi
     resolution: float = 0.0
     maximum: float = math.inf
+    rounding: float = 0.0
 
     def spacing(self, count: int) -> float:
         """Radians from one of so many beams to the next.
@@ -34,6 +36,10 @@ class FrontLaser(NamedTuple):
         ends = self.field_of_view / count, self.field_of_view / max(count - 1, 1)
         nearest = min(ends, key=lambda spacing: abs(spacing - self.resolution))
         return nearest if abs(nearest - self.resolution) <= ends[1] - ends[0] else even
+
+    def fits(self, count: int) -> bool:
+        """Whether so many beams cover the field of view at the resolution, as far as it is known."""
+        return not self.resolution or agree(self.field_of_view, self.resolution, count, self.rounding)
 
 
 def even_spacing(field_of_view: float, count: int) -> float:

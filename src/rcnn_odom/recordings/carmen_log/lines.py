@@ -22,6 +22,8 @@ from rcnn_odom.recordings.carmen_log.beams import (
     even_spacing,
     rounding_of,
 )
+from rcnn_odom.recordings.carmen_log.params import OPTION
+from rcnn_odom.recordings.laser_scan import has_most_beyond
 
 OVERLAP = 0.1
 """Radians: by no more than this do the beams of a laser that turns all round overlap."""
@@ -31,7 +33,8 @@ NOT_RADIANS = "are its angles in degrees, not radians?"
 class LaserLine(NamedTuple):
     """What one laser line says; angles in radians, lengths in metres.
 
-    The spacing is negative where the beams run clockwise.
+    The spacing is negative where the beams run clockwise. A maximum that most readings contradict is
+    doubted: it is infinite here, as an unknown one is.
     """
 
     kind: str
@@ -42,16 +45,22 @@ class LaserLine(NamedTuple):
     stamp: float
     laser: list[float]
     robot: list[float]
+    is_maximum_doubted: bool = False
 
 
 def parse_flaser(fields: list[str], front: FrontLaser) -> LaserLine:
     """A FLASER line, whose beams lie symmetrically about straight ahead.
 
     Raises:
-        ValueError: it is broken.
+        ValueError: it is broken, or its number of readings is not that of the laser.
     """
     count = _count(fields, 1)
     _need_fields(fields, 2 + count + 9, count)
+    if not front.fits(count):
+        raise ValueError(
+            f"{count} readings, {math.degrees(front.resolution):.4g} degrees apart by the log's PARAM lines, "
+            f"do not cover {math.degrees(front.field_of_view):.4g} degrees; if they do, say so with {OPTION}"
+        )
     pose = _finite(fields[2 + count : 9 + count])
     return LaserLine(
         kind=fields[0],
@@ -76,16 +85,19 @@ def parse_robotlaser(fields: list[str], _: FrontLaser) -> LaserLine:
     remissions = int(fields[9 + count])
     _need_fields(fields, 24 + count + remissions, count)
     spacing, maximum = _spacing(fields[3], fields[4], count), float(fields[5])
+    readings = np.array([float(word) for word in fields[9 : 9 + count]])
+    doubted = maximum > 0 and has_most_beyond(readings, maximum)
     poses = _finite(fields[10 + count + remissions : 16 + count + remissions])
     return LaserLine(
         kind=fields[0],
-        readings=np.array([float(word) for word in fields[9 : 9 + count]]),
+        readings=readings,
         first_angle=_start_angle(fields[2]),
         spacing=spacing,
-        maximum=maximum if maximum > 0 else math.inf,
+        maximum=maximum if maximum > 0 and not doubted else math.inf,
         laser=poses[:3],
         robot=poses[3:],
         stamp=_finite(fields[-3:-2])[0],
+        is_maximum_doubted=doubted,
     )
 
 
@@ -101,6 +113,8 @@ def _start_angle(word: str) -> float:
 
 def _spacing(fov_word: str, resolution_word: str, count: int) -> float:
     """Radians from beam to beam, counter-clockwise, from what a line says of them.
+
+    The sign is that of the resolution, and of the field of view only where there is no resolution.
 
     Raises:
         ValueError: field of view, resolution and number of readings do not fit.

@@ -11,7 +11,6 @@ from typing import NamedTuple
 import numpy as np
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.carmen_log.beams import (
     CIRCLE,
     PRINTED,
@@ -25,12 +24,19 @@ from rcnn_odom.recordings.text import lines_of
 NAME = re.compile(r"front_?laser_(fov|resolution|max)$")
 """As in laser_front_laser_fov (radians), laser_frontlaser_resolution (degrees), robot_front_laser_max (m)."""
 OPTION = "data.field_of_view_deg=..., of rcnn-odom run: --field-of-view-deg"
+IN_RADIANS = ": is it in radians, not degrees?"
 USUAL_DEG = 180.0
 """Of the lasers of most logs, where nothing else is known."""
 MOST_BEYOND = 0.03
 """Part of the readings that may lie beyond a maximum that is believed."""
 SAME_CODE = 0.01
 """Readings this close to the most frequent one beyond the maximum are the same code for no return."""
+ONE_READING = 0.001
+"""Part of a reading: what differs by less is counted as one, so that a long log needs no more memory."""
+COARSEST_RADIANS = 0.1
+"""No planar laser's beams lie farther apart."""
+SHOWN = 40
+"""Characters of a word that is no number."""
 
 
 class Parameter(NamedTuple):
@@ -53,12 +59,12 @@ class FoundLaser(NamedTuple):
     Attributes:
         laser: itself.
         notes: where this is known from, where that is not a matter of course.
-        contradiction: between the log and an option that stands before it; empty if there is none.
+        warnings: of what the log says and is not used: it is no number, or an option stands before it.
     """
 
     laser: FrontLaser
     notes: list[str]
-    contradiction: str = ""
+    warnings: list[str]
 
 
 def check_field_of_view(field_of_view_deg: float | None) -> None:
@@ -79,38 +85,53 @@ def find_front_laser(path: Path, field_of_view_deg: float | None) -> FoundLaser:
     Raises:
         InputError: what the log says contradicts itself, and no option settles it.
     """
-    parameters, counts = _survey(path)
+    parameters, counts, unusable = _survey(path)
     if not counts:
         given = field_of_view_deg is not None
-        return FoundLaser(FrontLaser(), ["field_of_view_deg is of FLASER lines: not used"] if given else [])
+        notes = ["field_of_view_deg is of FLASER lines: not used"] if given else []
+        return FoundLaser(FrontLaser(), notes, [])
     [(count, _)] = counts.most_common(1)
     if field_of_view_deg is None:
         _need_agreement(path, parameters, count)
     degrees, notes, contradiction = _choose_field_of_view(parameters, count, field_of_view_deg)
     maximum, about_maximum = _believed_maximum(path, parameters["max"])
-    resolution = 0.0
-    if parameters["resolution"] and not contradiction:
-        resolution = math.radians(parameters["resolution"][-1].value)
-    return FoundLaser(
-        FrontLaser(math.radians(degrees), resolution, maximum), notes + about_maximum, contradiction
-    )
+    laser = FrontLaser(math.radians(degrees), maximum=maximum)
+    for said in parameters["resolution"][-1:]:
+        rounding = rounding_of(said.word)
+        if not contradiction and agree(degrees, said.value, count, rounding):
+            rounding = math.inf if field_of_view_deg is not None else math.radians(rounding)
+            laser = laser._replace(resolution=math.radians(said.value), rounding=rounding)
+    return FoundLaser(laser, notes + about_maximum, unusable + ([contradiction] if contradiction else []))
 
 
-def _survey(path: Path) -> tuple[Parameters, Counter[int]]:
-    """The parameters by what they say, and how many FLASER lines there are of each number of readings."""
+def _survey(path: Path) -> tuple[Parameters, Counter[int], list[str]]:
+    """The parameters by what they say, how many FLASER lines there are of each number of readings, and
+    words on the parameters that say nothing.
+    """
     parameters: Parameters = {"fov": [], "resolution": [], "max": []}
     counts: Counter[int] = Counter()
+    unusable: dict[str, None] = {}
     for kind, rest in _head_of_lines(path):
         first, *more = rest.split(None, 2)
         if kind == "FLASER":
             counts[_count(first)] += 1
         elif kind == "PARAM" and more and (match := NAME.search(first)):
-            with contextlib.suppress(ValueError):  # "off", "none"
-                value = float(more[0])
-                if PRINTED < value < math.inf:  # 0 where nobody has set it
-                    parameters[match[1]].append(Parameter(first, value, more[0]))
+            said = Parameter(first, _number(more[0]), more[0])
+            if PRINTED < said.value < math.inf:
+                parameters[match[1]].append(said)
+            elif said.value != 0:  # as where nobody has set it
+                fault = "not above 0" if math.isfinite(said.value) else "no number"
+                unusable[f"the log's {said._replace(word=said.word[:SHOWN])} is {fault}, not used"] = None
     del counts[0]
-    return parameters, counts
+    return parameters, counts, list(unusable)
+
+
+def _number(word: str) -> float:
+    """What a word says, nan where it is none."""
+    try:
+        return float(word)
+    except ValueError:
+        return math.nan
 
 
 def _count(word: str) -> int:
@@ -148,11 +169,25 @@ def _need_agreement(path: Path, parameters: Parameters, count: int) -> None:
         for resolution in parameters["resolution"][-1:]:
             degrees, rounding = math.degrees(fov.value), rounding_of(resolution.word)
             if not agree(degrees, resolution.value, count, rounding):
+                in_radians = agree(fov.value, resolution.value, count, rounding)
                 raise InputError(
                     f"{path}: {fov} ({degrees:.4g} degrees) and {resolution} (degrees) do not fit {count} "
-                    f"readings, which cover {resolution.value * (count - 1):.4g} degrees at that resolution; "
-                    f"say which field of view is right ({OPTION})"
+                    f"readings, which cover {resolution.value * (count - 1):.4g} degrees at that resolution"
+                    f"{IN_RADIANS if in_radians else ''}; say which field of view is right ({OPTION})"
                 )
+    if not parameters["fov"]:
+        _need_degrees(path, parameters["resolution"][-1:], count)
+
+
+def _need_degrees(path: Path, resolutions: list[Parameter], count: int) -> None:
+    """Refuses a resolution by which the readings cover as many degrees as a laser's may cover radians."""
+    for resolution in resolutions:
+        covered = _covered(resolution.value, count)
+        if resolution.value < COARSEST_RADIANS and covered < CIRCLE:
+            raise InputError(
+                f"{path}: by {resolution} (degrees) its {count} readings cover {covered:.4g} degrees"
+                f"{IN_RADIANS}; say the field of view ({OPTION})"
+            )
 
 
 def _said_field_of_view(parameters: Parameters, count: int) -> tuple[float, Parameter] | None:
@@ -194,20 +229,20 @@ def _believed_maximum(path: Path, said: list[Parameter]) -> tuple[float, list[st
     if not said:
         return math.inf, []
     largest = max(said, key=lambda parameter: parameter.value)
-    positive, beyond = _readings_beyond(path, largest.value)
-    values, counts = np.unique(beyond, return_counts=True)
-    if not len(values):
+    positive, beyond = _count_beyond(path, largest.value)
+    if not beyond:
         return largest.value, []
-    code = values[np.argmax(counts)]
-    share = np.count_nonzero(np.abs(beyond - code) > SAME_CODE * code) / positive
-    if share > MOST_BEYOND:
-        return math.inf, [f"the log's {largest} is not believed: {share:.0%} of the readings lie beyond it"]
-    return largest.value, [f"{len(beyond)} readings at the log's {largest} m or beyond are no returns"]
+    [(code, _)] = beyond.most_common(1)
+    others = sum(beyond[size] for size in beyond if abs(size - code) * ONE_READING > SAME_CODE)
+    if others / positive > MOST_BEYOND:
+        share = f"{others / positive:.0%} of the readings"
+        return math.inf, [f"the log's {largest} is not believed: {share} lie beyond it"]
+    return largest.value, [f"{beyond.total()} readings at the log's {largest} m or beyond are no returns"]
 
 
-def _readings_beyond(path: Path, maximum: float) -> tuple[int, FloatArray]:
-    """How many readings are positive, and those from the maximum on."""
-    positive, beyond = 0, [np.empty(0)]
+def _count_beyond(path: Path, maximum: float) -> tuple[int, Counter[int]]:
+    """How many readings are positive, and how many from the maximum on, by the size of their logarithm."""
+    positive, beyond = 0, Counter[int]()
     for kind, rest in _head_of_lines(path):
         if kind != "FLASER":
             continue
@@ -218,5 +253,6 @@ def _readings_beyond(path: Path, maximum: float) -> tuple[int, FloatArray]:
             continue  # a broken line, told by whoever reads the scans
         readings = readings[(readings > 0) & np.isfinite(readings)]
         positive += len(readings)
-        beyond.append(readings[readings >= maximum])
-    return positive, np.concatenate(beyond)
+        sizes = np.round(np.log(readings[readings >= maximum]) / ONE_READING).astype(int)
+        beyond.update(sizes.tolist())
+    return positive, beyond

@@ -1,0 +1,83 @@
+"""LaserScan messages as scans: their limits, angles, and readings that are no returns."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rcnn_odom.recordings.laser_scan import from_laser_scan, has_most_beyond
+
+NAN, INF = math.nan, math.inf
+
+
+def ranges_of(ranges, **limits):
+    return from_laser_scan(ranges, 0.0, 0.1, **limits).ranges
+
+
+@pytest.mark.parametrize(
+    ("ranges", "limit", "beyond"),
+    [
+        (np.r_[np.full(55, 8191.0), np.linspace(100, 3000, 45)], 100, True),
+        (np.r_[np.full(55, 8191.0), np.linspace(1, 30, 45)], 100, False),
+        (np.r_[np.full(55, INF), np.full(20, NAN), np.zeros(9), np.linspace(100, 3000, 45)], 100, True),
+        (np.r_[np.linspace(1, 30, 51), np.linspace(101, 200, 49)], 100, False),
+        (np.r_[np.linspace(1, 30, 49), np.linspace(101, 200, 51), 300], 100, True),
+        (np.r_[np.full(10, 1.0), np.full(10, 101.0), 300], 100, False),  # half is not most
+        (np.full(50, 8191.0), 100, False),
+        (np.linspace(0.99, 1, 9) * 500, 100, False),
+        (np.zeros(5), 100, False),
+        (np.full(5, INF), 100, False),
+        (np.array([]), 100, False),
+    ],
+)
+def test_whether_most_readings_are_beyond(ranges, limit, beyond):
+    assert has_most_beyond(ranges, limit) is beyond
+
+
+def test_a_maximum_that_most_readings_contradict_is_not_believed():
+    far = np.linspace(1, 80, 100)
+    np.testing.assert_array_equal(ranges_of(far, range_max=10.0), far)
+    near = np.r_[np.linspace(1, 7, 60), np.linspace(8.5, 9.5, 10), np.full(40, 30.0)]
+    expected = np.where(near < 8, near, INF)
+    np.testing.assert_array_equal(ranges_of(near, range_max=8.0), expected)
+    # Where nothing came back in most directions, the constant there contradicts nothing.
+    np.testing.assert_array_equal(ranges_of([1.0, 2.0, *[65.5] * 20], range_max=30.0), [1, 2, *[INF] * 20])
+
+
+def test_limits_count_as_in_rep_117():
+    ranges = [0.05, 0.1, 7.9, 8.0, 8.5, INF, -INF, NAN, 0.0, -1.0]
+    expected = [0.0, 0.1, 7.9, INF, INF, INF, 0, 0, 0, 0]
+    np.testing.assert_array_equal(ranges_of(ranges, range_min=0.1, range_max=8.0), expected)
+
+
+@pytest.mark.parametrize("limits", [(0, 0), (0.1, 0.1), (0.1, 0.0), (NAN, NAN), (0, INF), (0, -1), (INF, 8)])
+def test_limits_that_no_laser_has_limit_nothing(limits):
+    low, high = limits
+    np.testing.assert_array_equal(ranges_of([0.5, 80.0], range_min=low, range_max=high), [0.5, 80])
+
+
+@pytest.mark.parametrize("increment", [0.0, NAN, INF])
+def test_beams_are_even_up_to_the_last_angle_where_their_spacing_is_left_out(increment):
+    scan = from_laser_scan(np.ones(5), 1.0, increment, -1.0)
+    np.testing.assert_allclose(scan.bearings, [1, 0.5, 0, -0.5, -1])
+    np.testing.assert_array_equal(from_laser_scan([1.0], 1.0, increment).bearings, [1])
+    assert len(from_laser_scan([], 1.0, increment).bearings) == 0
+    for last in (NAN, INF, 1.0):
+        with pytest.raises(ValueError, match=r"its angle_increment is .* and its angle_max"):
+            from_laser_scan([1.0, 1.0], 1.0, increment, last)
+
+
+def test_the_spacing_stands_before_the_last_angle():
+    np.testing.assert_allclose(from_laser_scan(np.ones(3), 0.5, -0.25, 7.0).bearings, [0.5, 0.25, 0])
+    for first in (NAN, INF):
+        with pytest.raises(ValueError, match="its angle_min is"):
+            from_laser_scan([1.0, 1.0], first, 0.1, 1.0)
+
+
+@pytest.mark.parametrize(
+    ("increment", "times"), [(0.001, [0, 0.001, 0.002]), (0, None), (NAN, None), (INF, None)]
+)
+def test_times_of_beams(increment, times):
+    scan = from_laser_scan(np.ones(3), 0.0, 0.1, time_increment=increment, stamp=2.5, frame_id="laser")
+    np.testing.assert_array_equal(scan.times, times)
+    assert (scan.stamp, scan.frame_id) == (2.5, "laser")
