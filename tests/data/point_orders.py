@@ -34,6 +34,14 @@ def thin(points: Points, leaf: float = 0.1) -> Points:
     return (sums / np.bincount(which.ravel())[:, None]).astype(points.dtype)
 
 
+def beginning_anywhere(points: Points) -> Points:
+    """Laser by laser, the turn of each of them from another direction on."""
+    rng = np.random.default_rng(0)
+    azimuth = _azimuth(points)
+    rings = np.split(points, np.flatnonzero(np.diff(azimuth) < -np.pi) + 1)
+    return np.concatenate([np.roll(ring, rng.integers(len(ring)), axis=0) for ring in rings])
+
+
 PERMUTED: dict[str, Order] = {
     "sorted by azimuth": lambda points: points[np.argsort(_azimuth(points))],
     "sorted by azimuth from behind": lambda points: points[
@@ -43,6 +51,7 @@ PERMUTED: dict[str, Order] = {
     "reversed": lambda points: points[::-1],
     "by columns": by_columns,
     "turning clockwise": turning_clockwise,
+    "beginning anywhere": beginning_anywhere,
     "sorted by range": lambda points: points[np.argsort(np.hypot(points[:, 0], points[:, 1]))],
     "sorted by height": lambda points: points[np.argsort(points[:, 2])],
 }

@@ -167,18 +167,26 @@ any_angle = st.sampled_from(
     ["0", "-1.570796", "3.141593", "6.283185", "180", "-90", "1", "0.5", "22.5", "0.392699", "-0.392699", "9"]
 )
 any_word = any_angle | any_float.map(str) | st.sampled_from(ODD_WORDS).filter(str.strip)
+any_word |= st.sampled_from(["3,1416", "=", "0.0174533", "-3.141593"])
 
 
-@given(head=st.lists(any_word, min_size=4, max_size=4), params=st.lists(any_word, min_size=3, max_size=3))
-def test_what_carmen_logs_say_of_their_laser(log, head, params):
-    """Whatever is read has its beams within a circle, in steps that fit it."""
+@given(
+    head=st.lists(any_word, min_size=4, max_size=4),
+    params=st.lists(any_word, min_size=3, max_size=3),
+    lost=st.sampled_from([0, 0, 1, 4, 7]),
+)
+def test_what_carmen_logs_say_of_their_laser(log, head, params, lost):
+    """Whatever is read has its beams within a circle, in steps that fit it, also where some get lost."""
     folder, contents = log
     lines = contents["ROBOTLASER1"].decode().splitlines()
     words = lines[-1].split()
     words[2:6] = head
     lines[-1] = " ".join(words)
     params = LASER_PARAMS.format(*params)
-    for content in ("\n".join(lines), f"{params}\n" + contents["FLASER"].decode()):
+    *before, last = contents["FLASER"].decode().splitlines()
+    words = last.split()
+    words[1:] = [str(9 - lost), *words[2 + lost :]]
+    for content in ("\n".join(lines), "\n".join([params, *before, " ".join(words)])):
         path = folder / "said.log"
         path.write_text(content)
         loaded = try_all("CARMEN logs loaded", lambda: carmen.load("said", root=folder))
@@ -249,8 +257,11 @@ def test_kitti_points_in_any_order(tmp_path_factory, data, order, rings):
     make_kitti(root, ["00"], frames=2, rings=rings, beams=data.draw(st.integers(1, 60)))
     for path in sorted((root / "sequences" / "00" / "velodyne").iterdir())[data.draw(st.integers(0, 1)) :]:
         found = np.fromfile(path, "<f4").reshape(-1, 4)
+        found[:, 2] += data.draw(st.sampled_from([0.0, 0.0, 1.73, -40.0]))
         if len(found):
-            np.ascontiguousarray(ORDERS[order](found), "<f4").tofile(path)
+            found = np.ascontiguousarray(ORDERS[order](found), "<f4")
+            found[:: data.draw(st.sampled_from([1, 2, 10**6]))] = data.draw(st.sampled_from([0.0, np.nan]))
+            found.tofile(path)
     sequence = try_all("KITTI orders", lambda: kitti.load("00", root=root))
     if sequence is not None:
         check_sequence(sequence)
@@ -327,7 +338,10 @@ json_scans = st.fixed_dictionaries(
 )
 json_scans = (
     json_scans
-    | st.fixed_dictionaries({"op": st.sampled_from(["publish", "status"]) | json_values, "msg": json_scans})
+    | st.fixed_dictionaries(
+        {"op": st.sampled_from(["publish", "status"]) | json_values, "msg": json_scans},
+        optional={"topic": st.sampled_from(["/scan", "/b"]) | json_values},
+    )
 ).map(json.dumps)
 GOOD_LINE = json.dumps({"ranges": [1.5, None, 2.25], "angle_min": -1.0, "angle_increment": 0.5, "stamp": 3})
 
@@ -359,12 +373,14 @@ def test_files_of_json_lines(tmp_path_factory, data):
 @given(
     json_scans
     | st.text(max_size=80)
+    | st.lists(json_scans, max_size=5).map("\n".join)
     | st.sampled_from([GOOD_LINE, LASER_SCAN])
     .flatmap(lambda line: damaged(line.encode()))
-    .map(lambda content: content.decode(errors="replace"))
+    .map(lambda content: content.decode(errors="replace")),
+    st.none() | st.sampled_from(["/scan", "b", ""]),
 )
-def test_json_lines(line):
-    stream = json_lines.stream_lines(line.split("\n"))
+def test_json_lines(line, topic):
+    stream = json_lines.stream_lines(line.split("\n"), topic=topic)
     scans = try_all("JSON lines", lambda: list(stream.scans)) or []
     assert len(scans) + stream.skipped.total() == sum(
         bool(part.lstrip("\ufeff").strip()) for part in line.split("\n")
@@ -600,3 +616,15 @@ def test_metadata_of_bags(bags, metadata):
     (bag / "a.mcap").write_bytes((bags / "mcap").read_bytes())
     (bag / "metadata.yaml").write_bytes(metadata)
     assert len(stream_bag(bag)) in (0, 6)
+
+
+@given(data=st.data(), kind=st.sampled_from(["mcap", "sqlite3"]), place=st.integers(0, 2))
+def test_bags_of_several_files(bags, data, kind, place):
+    """Whatever becomes of one file, the others are read."""
+    bag, content = bags / f"split {kind}", (bags / kind).read_bytes()
+    bag.mkdir(exist_ok=True)
+    for number in range(3):
+        (bag / f"{number}.db3").write_bytes(content)
+    (bag / f"{place}.db3").write_bytes(data.draw(damaged(content) | st.binary(max_size=300)))
+    scans = stream_bag(bag, topic="/scan")
+    assert len(scans) >= 12

@@ -96,6 +96,8 @@ def test_a_pose_by_hand(root: Path) -> None:
     for frame, latitude in ((0, 49.0), (1, 49.00001)):
         words = [latitude, 8.4, 100.0 + frame, roll, pitch, yaw, *np.zeros(24)]
         oxts_file(root, frame).write_text(" ".join(map(repr, map(float, words))))
+    for frame in range(2, 6):
+        scan_file(root, frame).unlink()
     poses = load(root).poses @ VELO_FROM_IMU
     sin, cos = np.sin, np.cos
     about_x = np.array([[1, 0, 0], [0, cos(roll), -sin(roll)], [0, sin(roll), cos(roll)]])
@@ -125,6 +127,18 @@ def test_text_gives_the_same_scans(root: Path) -> None:
     for frame in range(6):
         for values, expected in zip(beams(load(root).read_scan(frame)), wanted[frame], strict=True):
             np.testing.assert_array_equal(values, expected)
+
+
+def test_other_texts_beside_the_scans(root: Path) -> None:
+    readme = scan_file(root, 0).with_name("readme.txt")
+    readme.write_text("about")
+    assert len(load(root)) == 6
+    assert not any(".txt" in note for note in load(root).notes)
+    for frame in range(6):
+        scan_file(root, frame).unlink()
+        scan_file(root, frame).with_suffix(".txt").touch()
+    readme.unlink()
+    assert "0.txt: 0 bytes in it, so the file is empty; " in refusal(lambda: load(root))
 
 
 @pytest.mark.parametrize("below", ["", "velodyne_points", "velodyne_points/data"])
@@ -206,7 +220,78 @@ def test_poses_of_a_drive_that_is_not_synchronised(root: Path) -> None:
     for frame in range(60):
         oxts_file(root, frame).write_text(oxts_line(np.eye(4)))
     text = refusal(lambda: load(root))
-    assert "oxts/timestamps.txt: the poses were measured 6.2 s from their scans; " in text
+    assert "oxts/timestamps.txt: the poses were measured up to 6.4 s from their scans; " in text
+
+
+def test_numbers_that_differ_by_more_than_an_offset(root: Path) -> None:
+    make_kitti_raw(root, "2011_09_27_drive_0001_sync", frames=8)
+    drive = root / "2011_09_27" / "2011_09_27_drive_0001_sync"
+    (drive / "oxts" / "data" / "0000000005.txt").unlink()
+    (drive / "velodyne_points" / "data" / "0000000003.bin").unlink()
+    text = refusal(lambda: kitti_raw.load(drive.name, root=root))
+    assert "oxts/data: as many files as scans, but their numbers differ: there is none for scan 5; " in text
+
+
+def test_a_pose_of_another_moment_is_found(root: Path) -> None:
+    times = drive_in(root) / "oxts" / "timestamps.txt"
+    lines = times.read_text().splitlines()
+    lines[5] = "2011-09-26 13:02:27.000000000"
+    times.write_text("\n".join(lines))
+    assert "the poses were measured up to 0." in refusal(lambda: load(root))
+
+
+# Truth that cannot be
+
+
+def change_oxts(root: Path, change, frames=range(6)) -> None:
+    for frame in frames:
+        values = np.array(oxts_file(root, frame).read_text().split(), dtype=float)
+        oxts_file(root, frame).write_text(" ".join(map(repr, change(values).tolist())))
+
+
+def in_place(index, value):
+    def change(values):
+        values[index] = value(values[index]) if callable(value) else value
+        return values
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("change", "frames", "says"),
+    [
+        (
+            in_place(0, lambda latitude: latitude + 0.001),
+            [3],
+            r"3\.txt:1: frame 3 is 11[012] m from the one bef",
+        ),
+        (in_place(0, 0.0), [2], r"2\.txt:1: frame 2 is \d+ m from the one before, 0\.10 s earlier; correct"),
+        (in_place(5, 90.0), range(6), r"0\.txt:1: an angle is above 2 pi, but it begins with .*radians"),
+        (
+            in_place([0, 1], lambda two: two[::-1]),
+            range(6),
+            "the places move [5-9][0-9] degrees aside of yaw",
+        ),
+    ],
+    ids=["jump", "latitude 0", "degrees", "swapped"],
+)
+def test_absurd_truth_is_refused(root: Path, change, frames, says: str) -> None:
+    load(root)
+    change_oxts(root, change, frames)
+    with pytest.raises(InputError, match=says) as raised:
+        load(root)
+    assert "\n" not in str(raised.value)
+    assert kitti_raw.stream(drive_in(root)).total == 6
+
+
+def test_stamps_of_whole_seconds_are_refused(root: Path) -> None:
+    lines = [line[:19] for line in stamps_file(root).read_text().splitlines()]
+    assert lines[0] != lines[-1]
+    stamps_file(root).write_text("\n".join(lines))
+    text = refusal(lambda: load(root))
+    assert (
+        "velodyne_points/timestamps.txt:3: the stamps are whole seconds, several frames in one; take" in text
+    )
 
 
 # Bad input

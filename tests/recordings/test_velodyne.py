@@ -22,6 +22,7 @@ from rcnn_odom.recordings.velodyne import (
     ring_starts,
     split_rings,
 )
+from rcnn_odom.recordings.velodyne_files import read_points
 from scans import beams
 
 REAL = SHARED / "data" / "kitti"
@@ -276,6 +277,149 @@ def test_a_laser_of_one_beam_whose_turn_begins_aside(root: Path) -> None:
         bearings, ranges = beams(kitti.load("00", root=root).read_scan(0))
         assert len(bearings) == 900
         np.testing.assert_allclose(np.sort(ranges), np.sort(np.hypot(flat[:, 0], flat[:, 1])), rtol=1e-6)
+
+
+# Missing returns, other points, other frames
+
+
+def with_origins(points: np.ndarray) -> np.ndarray:
+    points = points.copy()
+    points[np.random.default_rng(3).random(len(points)) < 0.3] = 0
+    return points
+
+
+@pytest.mark.parametrize("order", [lambda points: points, shuffle])
+def test_points_at_the_origin_are_missing_returns(root: Path, order) -> None:
+    originals = [np.fromfile(scan_file(root, frame), "<f4").reshape(-1, 4) for frame in range(4)]
+    for frame, points in enumerate(map(with_origins, originals)):
+        points[points.any(axis=1)].tofile(scan_file(root, frame))
+    expected = encoded(root)
+    for frame, points in enumerate(map(with_origins, originals)):
+        order(points).tofile(scan_file(root, frame))
+    assert_nearly_all_equal(encoded(root), expected)
+
+
+def test_read_points_leaves_out_the_origin_only(tmp_path: Path) -> None:
+    points = np.array([[1, 2, 3, 0], [0, 0, 0, 0.5], [0, 0, 1, 0], [0, 2, 0, 0]], "<f4")
+    points.tofile(tmp_path / "a.bin")
+    np.savetxt(tmp_path / "a.txt", points)
+    for name in ("a.bin", "a.txt"):
+        np.testing.assert_array_equal(read_points(tmp_path / name), points[[0, 2, 3]])
+
+
+@pytest.mark.parametrize("floats", [3, 5, 6])
+def test_other_than_four_floats_a_point_are_refused(root: Path, floats: int) -> None:
+    def pack(points: np.ndarray) -> np.ndarray:
+        extra = np.tile(np.arange(len(points), dtype="<f4")[:, None] % 30, (1, 3))
+        packed = np.concatenate([points[:, :3], extra], axis=1)[: len(points) // 4 * 4, :floats]
+        return packed.reshape(-1, 4)
+
+    reorder(root, pack)
+    with pytest.raises(
+        InputError, match=r"000000\.bin: not four 32-bit floats a point \(x y z reflectance\): "
+    ):
+        kitti.load("00", root=root)
+
+
+@pytest.mark.parametrize(("floats", "says"), [(3, "has 3 32-bit"), (5, "has 5 32-bit")])
+def test_a_size_of_other_points_says_so(root: Path, floats: int, says: str) -> None:
+    scan_file(root, 1).write_bytes(bytes(4 * floats * 7))
+    with pytest.raises(
+        InputError, match=rf"{28 * floats} bytes are no whole number of .* cut off, or {says}"
+    ):
+        kitti.load("00", root=root)
+
+
+@pytest.mark.parametrize("height", [-1.0, 0.9, 1.73, 3.0])
+def test_a_raised_cloud_is_read_by_its_rings(tmp_path: Path, height: float) -> None:
+    made = laser_sequence(tmp_path / "laser", lambda points: points)
+    raised = laser_sequence(tmp_path / "raised", lambda points: points + np.array([0, 0, height]))
+    found, wanted = (kitti.load("00", root=path) for path in (raised, made))
+    assert found.read_scan.ring == wanted.read_scan.ring
+    assert found.read_scan.rise == pytest.approx(height, abs=0.01)
+    assert f"beams meet at {found.read_scan.rise:+.2f} m" in found.notes[2]
+    np.testing.assert_array_equal(found.read_scan(1).ranges, wanted.read_scan(1).ranges)
+    laser_sequence(tmp_path / "raised", lambda points: shuffle(points + np.array([0, 0, height])))
+    with pytest.raises(
+        InputError, match="they gather at no beams as seen from the laser, so they are not in"
+    ):
+        kitti.load("00", root=raised)
+
+
+def laser_sequence(root: Path, change) -> Path:
+    """A sequence of a laser that has KITTI's beams, its points (P, 3) changed."""
+    if not root.exists():
+        make_kitti(root, ["00"], frames=2)
+    beams_deg = [*np.arange(2.0, -8.0, -0.35), *np.arange(-8.0, -24.0, -0.5)]
+    for frame in range(2):
+        points = change(laser(beams_deg, points=600, seed=frame))
+        np.column_stack([points, np.zeros(len(points))]).astype("<f4").tofile(scan_file(root, frame))
+    return root
+
+
+def turned(points: np.ndarray, angle: float = 0.05) -> np.ndarray:
+    cos, sin = np.cos(angle), np.sin(angle)
+    return points @ np.array([[cos, 0, -sin], [0, 1, 0], [sin, 0, cos]])
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        (turned, r"the points of ring \d+ lie [23]\.\d degrees from their cone"),
+        (lambda points: shuffle(turned(points)), "they gather at no beams as seen from the laser"),
+        (lambda points: turned(points, 0.35), "not in the laser's frame|not in its frame|too far from level"),
+        (
+            lambda points: np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1),
+            r"[45]\d % of the points are steeper than 45 degrees, as in a camera's frame; give them",
+        ),
+    ],
+)
+def test_points_in_another_frame_are_refused(tmp_path: Path, change, says: str) -> None:
+    root = laser_sequence(tmp_path / "made", change)
+    with pytest.raises(InputError, match=says) as raised:
+        kitti.load("00", root=root)
+    assert "\n" not in str(raised.value)
+
+
+def test_a_given_ring_of_another_frame_stands(tmp_path: Path) -> None:
+    root = laser_sequence(tmp_path / "made", turned)
+    assert len(kitti.load("00", root=root, ring=6).read_scan(0).ranges) == 600
+
+
+def test_a_slight_tilt_is_read(tmp_path: Path) -> None:
+    root = laser_sequence(tmp_path / "made", lambda points: turned(points, 0.005))
+    assert len(kitti.load("00", root=root).read_scan(0).ranges) == 600
+
+
+BLANK = {
+    "nan": np.full((900, 4), np.nan),
+    "zero": np.zeros((900, 4)),
+    "one point": np.array([[5.0, 1.0, 4.0, 0.0]]),
+}
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("blank", BLANK)
+@pytest.mark.parametrize("ring", [None, 3])
+@pytest.mark.parametrize("order", [lambda points: points, shuffle])
+def test_a_blank_frame_is_a_scan_without_returns(root: Path, blank: str, ring: int | None, order) -> None:
+    reorder(root, order)
+    if order is shuffle:
+        ring = None
+    wanted = kitti.load("00", root=root, ring=ring)
+    BLANK[blank].astype("<f4").tofile(scan_file(root, 1))
+    found = kitti.load("00", root=root, ring=ring)
+    assert found.notes == wanted.notes
+    assert len(found.read_scan(1).ranges) == 0
+    np.testing.assert_array_equal(found.read_scan(2).ranges, wanted.read_scan(2).ranges)
+
+
+@pytest.mark.filterwarnings("error")
+def test_nothing_but_blank_frames_is_refused(root: Path) -> None:
+    for frame in range(4):
+        BLANK["nan"].astype("<f4").tofile(scan_file(root, frame))
+    with pytest.raises(InputError, match=r"000000\.bin: neither it nor the other frames have a point; "):
+        kitti.load("00", root=root)
 
 
 # A real drive

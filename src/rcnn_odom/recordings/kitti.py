@@ -17,8 +17,8 @@ from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_kitti, read_lines
 from rcnn_odom.recordings.velodyne_files import VELODYNE, choose_beam, file_key, list_numbered
 
-READER_VERSION = 3
-"""Raised whenever the same files would give other scans. 3: points that do not come laser by laser."""
+READER_VERSION = 4
+"""Raised whenever the same files would give other scans. 4: points at the origin are none."""
 
 
 def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:

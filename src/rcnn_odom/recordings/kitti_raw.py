@@ -5,6 +5,7 @@ Layout: ``DATE/DRIVE/{velodyne_points/{data/*.bin,timestamps.txt},oxts/data/*.tx
 """
 
 import hashlib
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -23,7 +24,7 @@ from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_lines
 from rcnn_odom.recordings.velodyne_files import VELODYNE, Scans, choose_beam, file_key, list_numbered
 
-READER_VERSION = 1
+READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
 
 VELODYNE_FOLDER = "velodyne_points"
@@ -31,6 +32,11 @@ EARTH_RADIUS = 6378137.0
 """Metres, as in the raw data's development kit."""
 SAME_MOMENT = 0.1
 """Seconds: a pose that was measured further from its scan belongs to another one."""
+FASTEST = 100.0
+"""Metres a second: with a place farther away the GPS/IMU was wrong."""
+LEAST_STEP, FEWEST_STEPS = 0.2, 5
+"""So many steps of so many metres tell in which direction a car drives."""
+MOST_SIDEWAYS = np.deg2rad(45.0)
 LISTED_DRIVES = 10
 STAMP = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?")
 
@@ -158,12 +164,14 @@ def _list_scans(drive: Path) -> tuple[Scans, tuple[str, ...]]:
     folder = drive / VELODYNE_FOLDER / "data"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; unpack the drive's Velodyne data, of its _sync archive")
-    scans, texts = list_numbered(folder, ".bin"), list_numbered(folder, ".txt")
+    scans = list_numbered(folder, ".bin")
+    texts = {} if scans else list_numbered(folder, ".txt")
     if not scans and not texts:
         raise InputError(f"{folder}: no .bin and no .txt file in it; unpack the drive's Velodyne data again")
     notes = [f"{len(scans or texts)} scans"]
-    if scans and texts:
-        notes.append(f"{len(texts)} .txt files beside the .bin files are not read")
+    unread = [path for path in folder.glob("*.txt") if path.stem.isdecimal()] if scans else []
+    if unread:
+        notes.append(f"{len(unread)} .txt files beside the .bin files are not read")
     frames = list(scans or texts)
     if lost := frames[-1] - frames[0] + 1 - len(frames):
         notes.append(f"{lost} frame numbers between the first and the last have no scan")
@@ -171,15 +179,22 @@ def _list_scans(drive: Path) -> tuple[Scans, tuple[str, ...]]:
 
 
 def _match(path: Path, frames: list[int], found: Mapping[int, T], what: str) -> list[T]:
-    """What belongs to the frames: by their numbers if all are there, or else by position.
+    """What belongs to the frames: by their numbers if all are there, or by position if all differ by as much.
 
     Raises:
-        InputError: the numbers are not all there, and there are not as many as frames.
+        InputError: it is neither way.
     """
     if all(frame in found for frame in frames):
         return [found[frame] for frame in frames]
+    numbers_found = sorted(found)
     if len(found) == len(frames):
-        return [found[number] for number in sorted(found)]
+        if len({number - frame for number, frame in zip(numbers_found, frames, strict=True)}) == 1:
+            return [found[number] for number in numbers_found]
+        lost = next(frame for frame in frames if frame not in found)
+        raise InputError(
+            f"{path}: as many {what} as scans, but their numbers differ: there is none for scan {lost}; copy "
+            "the drive again, all of it"
+        )
     raise InputError(
         f"{path}: {len(found)} {what} for {len(frames)} scans numbered {frames[0]} to {frames[-1]}; copy the "
         "drive again, all of it"
@@ -191,7 +206,15 @@ def _read_stamps(path: Path, frames: list[int]) -> FloatArray:
     lines = read_lines(path, "unpack the drive again")
     given = {number: line.strip() for number, line in enumerate(lines) if line.strip()}
     places = _match(path, frames, {number: number for number in given}, "time stamps")
-    return np.array([_parse_stamp(f"{path}:{number + 1}", given[number]) for number in places])
+    stamps = np.array([_parse_stamp(f"{path}:{number + 1}", given[number]) for number in places])
+    same = np.flatnonzero(np.diff(stamps) == 0)
+    if len(same) and (stamps % 1 == 0).all():
+        where = places[int(same[0]) + 1] + 1
+        raise InputError(
+            f"{path}:{where}: the stamps are whole seconds, several frames in one; take the drive's own "
+            "file, which has their fractions"
+        )
+    return stamps
 
 
 def _parse_stamp(where: str, text: str) -> float:
@@ -268,12 +291,43 @@ def _read_truth(drive: Path, frames: list[int], stamps: FloatArray) -> FloatArra
     chosen = _match(folder, frames, files, "files")
     if (times := folder.parent / "timestamps.txt").is_file():
         taken = _read_stamps(times, [int(path.stem) for path in chosen])
-        if (late := float(np.median(np.abs(taken - stamps)))) > SAME_MOMENT:
+        if (late := float(np.percentile(np.abs(taken - stamps), 95))) > SAME_MOMENT:
             raise InputError(
-                f"{times}: the poses were measured {late:.1f} s from their scans; take the synchronised "
-                "drive, _sync, where equal numbers belong together"
+                f"{times}: the poses were measured up to {late:.1f} s from their scans; take the "
+                "synchronised drive, _sync, where equal numbers belong together"
             )
-    return _imu_poses(np.array([_read_oxts(path) for path in chosen])) @ np.linalg.inv(laser_from_imu)
+    poses = _imu_poses(np.array([_read_oxts(path) for path in chosen]))
+    _check_speed(poses[:, :3, 3], stamps, chosen)
+    _check_direction(poses, folder)
+    return poses @ np.linalg.inv(laser_from_imu)
+
+
+def _check_speed(places: FloatArray, stamps: FloatArray, files: list[Path]) -> None:
+    """Raises InputError where a place (N, 3) in metres is too far from the one before it."""
+    distance, period = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(stamps)
+    # Clocks jitter: between two frames there is not much less than the usual time.
+    least = max(float(np.median(period)), 0.01) if len(period) else 0.0
+    for step in np.flatnonzero(distance > FASTEST * np.maximum(period, least)):
+        raise InputError(
+            f"{files[step + 1]}:1: frame {int(files[step + 1].stem)} is {distance[step]:.0f} m from the one "
+            f"before, {period[step]:.2f} s earlier; correct latitude, longitude and altitude"
+        )
+
+
+def _check_direction(poses: FloatArray, folder: Path) -> None:
+    """Raises InputError where a car with these poses (N, 4, 4) would slide sideways."""
+    steps = np.diff(poses[:, :2, 3], axis=0)
+    length = np.hypot(*steps.T)
+    moved = length > LEAST_STEP
+    if np.count_nonzero(moved) < FEWEST_STEPS:
+        return
+    along = np.abs(np.sum(steps * poses[:-1, :2, 0], axis=1))[moved] / length[moved]
+    aside = np.arccos(np.clip(np.median(along), 0.0, 1.0))
+    if aside > MOST_SIDEWAYS:
+        raise InputError(
+            f"{folder}: the places move {np.rad2deg(aside):.0f} degrees aside of yaw, as "
+            "where latitude and longitude are swapped, or yaw is in degrees; correct the files"
+        )
 
 
 def _read_oxts(path: Path) -> list[float]:
@@ -282,6 +336,8 @@ def _read_oxts(path: Path) -> list[float]:
     values = numbers(f"{path}:1", read_lines(path, "unpack the drive again")[0].split()[:6], 6, wanted)
     if not (abs(values[0]) < 90 and abs(values[1]) <= 360 and abs(values[2]) < 1e5):
         raise InputError(f"{path}:1: no place on earth, but {wanted}; correct the line")
+    if max(map(abs, values[3:])) > 2 * math.pi:
+        raise InputError(f"{path}:1: an angle is above 2 pi, but {wanted} (radians); correct the line")
     return values
 
 

@@ -29,14 +29,24 @@ MOST_STEPS_BACK = 0.25
 """Within a ring the azimuth grows but for noise and close objects: part of the steps that may go back."""
 RINGS_SPREAD = 0.5
 """The elevation spreads less than this within rings, as a part of its spread over all points."""
+SAME_LASER = np.deg2rad(0.06)
+AROUND_START = 5
+"""Points before and after the start of a ring whose elevations tell whether the laser is the same."""
+MOST_CUT = 0.25
+"""Part of the starts that may lie within a laser's turn: where a turn that begins aside is cut in two."""
 ONE_BEAM = np.deg2rad(0.1)
 """The elevation of a single beam spreads less than this."""
 HIGHEST = 0.5
 """Metres: the beams meet no farther than this from the origin."""
+HIGHEST_RISE = 3.5
+"""Metres: nor farther where the points were raised, to the ground or the base of a robot."""
 BIN = np.deg2rad(0.05)
 """Of a histogram of elevations."""
 SEEN = np.deg2rad(4.0)
 """Up to so far from level the elevations are looked at."""
+DISTINCT = 1.5
+"""Beams make a histogram of elevations so much sharper than its mean over half a degree: by 3 to 6 in KITTI,
+also where it is thinned to a grid of 0.2 m, but by 1.0 to 1.2 in a frame that is not the laser's."""
 LEAST_OF_BEAM = 0.2
 """Part of the fullest beam's points that a beam must have."""
 SHARPER = 1.1
@@ -68,13 +78,14 @@ def split_rings(points: Points) -> list[Points] | None:
 
     Returns:
         A single ring, whatever its order, where there is one beam alone. None where the points do not come
-        laser by laser: sorted by azimuth, shuffled, turning clockwise, one direction after the other.
+        laser by laser: sorted by azimuth, shuffled, turning clockwise, one direction after the other; or
+        where most turns begin in another direction than azimuth 0, so that they cannot be told apart.
     """
     starts = ring_starts(points)
     order = _Order(points, starts)
     if order.is_one_beam:
         return [points[:, :3]]
-    if not order.is_laser_by_laser:
+    if not order.is_laser_by_laser or _are_turns_cut(points, starts, order.height):
         return None
     ends = [*starts[1:], len(points)]
     return [points[start:end, :3] for start, end in zip(starts, ends, strict=True)]
@@ -105,6 +116,22 @@ def ring_starts(points: Points) -> npt.NDArray[np.int64]:
     return np.concatenate([[0], candidates[level > highest_before] + 1])
 
 
+def _are_turns_cut(points: Points, starts: npt.NDArray[np.int64], height: float) -> bool:
+    """Whether the same laser goes on over many of the starts, as where each turn begins somewhere else.
+
+    The elevation is seen from the height of where the beams meet: seen from elsewhere, neighbours may agree.
+    """
+    after = starts[1:, None] + np.arange(AROUND_START)  # (starts, points)
+    after = after[(after[:, -1] < len(points)) & (after[:, 0] >= AROUND_START)]
+    if len(after) < 2:
+        return False
+    elevation, before = (
+        np.median(elevations_from(points[at.ravel()], height).reshape(at.shape), axis=1)
+        for at in (after, after - AROUND_START)
+    )
+    return bool(np.mean(np.abs(elevation - before) < SAME_LASER) > MOST_CUT)
+
+
 def _azimuth(x: Points, y: Points, at: npt.NDArray[np.int64]) -> FloatArray:
     return np.arctan2(y[at], x[at], dtype=np.float64) % (2 * np.pi)
 
@@ -121,16 +148,20 @@ class _Order:
         self.steps_back = np.count_nonzero(back) / max(len(back), 1)
         distance = np.maximum(np.sqrt(self.x**2 + self.y**2), 1.0)
         self.slope, self.closeness = np.clip(z / distance, -1.0, 1.0), 1 / distance
-        ring = np.zeros(len(z), np.int64)
-        self.together = self._spread(ring)
+        self.together, _ = self._fit(np.zeros(len(z), np.int64), HIGHEST)
         # The number of starts before each point of the sample.
         firsts = np.minimum(-(-starts[1:] // stride), len(z))
         ring = np.cumsum(np.bincount(firsts, minlength=len(z) + 1)[: len(z)])
-        self.within = self._spread(ring)
+        within, _ = self._fit(ring, HIGHEST)
+        self.are_ringed = within <= RINGS_SPREAD * self.together
+        within, self.height = self._fit(ring, HIGHEST_RISE)
+        if not self.are_ringed:  # as of a raised cloud; as a whole it may lie about a higher cone, too
+            together, _ = self._fit(np.zeros(len(z), np.int64), HIGHEST_RISE)
+            self.are_ringed = within <= RINGS_SPREAD * together
 
     @property
     def is_laser_by_laser(self) -> bool:
-        return bool(self.steps_back < MOST_STEPS_BACK) and self.within <= RINGS_SPREAD * self.together
+        return bool(self.steps_back < MOST_STEPS_BACK) and self.are_ringed
 
     @property
     def is_one_beam(self) -> bool:
@@ -142,28 +173,32 @@ class _Order:
         fit = np.linalg.lstsq(plane, self.slope, rcond=None)[0]
         return bool(np.std(self.slope - plane @ fit) < ONE_BEAM)
 
-    def _spread(self, ring: npt.NDArray[np.int64]) -> float:
-        """Standard deviation in radians about the cone of each ring, all with their top at one height."""
+    def _fit(self, ring: npt.NDArray[np.int64], highest: float) -> tuple[float, float]:
+        """Standard deviation in radians about the cone of each ring, all with their top at one height.
+
+        That height in metres is given too, no more than ``highest`` from the origin.
+        """
         count = np.bincount(ring)
         freedom = len(ring) - np.count_nonzero(count) - 1
         if freedom <= 0:
-            return 0.0
+            return 0.0, 0.0
         share = 1 / np.maximum(count, 1)
         slope = self.slope - (np.bincount(ring, self.slope) * share)[ring]
         closeness = self.closeness - (np.bincount(ring, self.closeness) * share)[ring]
-        slope -= _slope_over(closeness, slope) * closeness
-        return float(np.sqrt(slope @ slope / freedom))
+        height = _slope_over(closeness, slope, highest)
+        slope -= height * closeness
+        return float(np.sqrt(slope @ slope / freedom)), height
 
 
-def _slope_over(closeness: FloatArray, slope: FloatArray) -> float:
+def _slope_over(closeness: FloatArray, slope: FloatArray, highest: float) -> float:
     """The height of the beams' meeting point, of values (P,) whose means are 0."""
     square = float(closeness @ closeness)
-    return float(np.clip(closeness @ slope / square, -HIGHEST, HIGHEST)) if square > 1e-9 else 0.0
+    return float(np.clip(closeness @ slope / square, -highest, highest)) if square > 1e-9 else 0.0
 
 
 def median_elevation(points: Points) -> float:
     """Of a ring's points (P, 3) seen from the origin, in radians; nan of no points."""
-    return float(np.median(_elevations(points, 0.0))) if len(points) else float("nan")
+    return float(np.median(elevations_from(points, 0.0))) if len(points) else float("nan")
 
 
 def fit_beam(ring: Points) -> Beam:
@@ -171,8 +206,8 @@ def fit_beam(ring: Points) -> Beam:
     x, y, z = ring[:, :3].astype(np.float64).T
     distance = np.maximum(np.hypot(x, y), 1.0)
     closeness, slope = 1 / distance, z / distance
-    height = _slope_over(closeness - closeness.mean(), slope - slope.mean())
-    return Beam(float(np.median(_elevations(ring, height))), height)
+    height = _slope_over(closeness - closeness.mean(), slope - slope.mean(), HIGHEST)
+    return Beam(float(np.median(elevations_from(ring, height))), height)
 
 
 def find_level_beam(clouds: Sequence[Points]) -> Beam:
@@ -182,18 +217,27 @@ def find_level_beam(clouds: Sequence[Points]) -> Beam:
         clouds: each (P, 3 or more) metres, frames of one laser.
 
     Raises:
-        ValueError: no beam is within 2 degrees of level.
+        ValueError: no beam is within 2 degrees of level, or the points gather at no beams at all.
     """
     points = np.concatenate([cloud[:, :3] for cloud in clouds])
-    height = _find_height(points[np.abs(_elevations(points, 0.0)) < SEEN])
+    height = _find_height(points[np.abs(elevations_from(points, 0.0)) < SEEN])
+    if not _are_distinct(elevations_from(points, height)):
+        raise ValueError("they gather at no beams as seen from the laser, so they are not in its frame")
     return Beam(level_elevation(clouds, height), height)
+
+
+def _are_distinct(elevations: FloatArray) -> bool:
+    """Whether elevations (P,) gather at beams, as far as any are near level."""
+    counts = np.histogram(elevations, int(2 * SEEN / BIN), (-SEEN, SEEN))[0].astype(np.float64)
+    smooth = np.convolve(counts, np.full(9, 1 / 9), "same")
+    return bool(counts @ counts >= DISTINCT * (smooth @ smooth))
 
 
 def _find_height(points: Points) -> float:
     """Where the beams meet: the height from which the elevations of points (P, 3) gather most."""
 
     def gathered(height: float) -> float:
-        counts, _ = np.histogram(_elevations(points, height), int(2 * SEEN / BIN), (-SEEN, SEEN))
+        counts, _ = np.histogram(elevations_from(points, height), int(2 * SEEN / BIN), (-SEEN, SEEN))
         return float(np.sum(counts.astype(np.float64) ** 2))
 
     best = max(np.arange(-HIGHEST, HIGHEST, 0.01), key=gathered)
@@ -215,8 +259,8 @@ def level_elevation(clouds: Sequence[Points], height: float = 0.0) -> float:
         ValueError: no beam is within 2 degrees of level.
     """
     points = np.concatenate([cloud[:, :3] for cloud in clouds])
-    points = points[np.abs(_elevations(points, height)) < SEEN]
-    elevations, from_origin = _elevations(points, height), _elevations(points, 0.0)
+    points = points[np.abs(elevations_from(points, height)) < SEEN]
+    elevations, from_origin = elevations_from(points, height), elevations_from(points, 0.0)
     near = [
         (float(np.median(elevations[of_beam])), float(np.median(from_origin[of_beam])))
         for peak in _find_peaks(elevations)
@@ -244,7 +288,7 @@ def points_at(points: Points, elevation: float, height: float = 0.0) -> Points:
         points: (P, 3 or more) metres, in any order.
         elevation, height: of the beam, see :class:`Beam`.
     """
-    return points[np.abs(_elevations(points, height) - elevation) < HALF_RING_SPACING, :3]
+    return points[np.abs(elevations_from(points, height) - elevation) < HALF_RING_SPACING, :3]
 
 
 def are_thinned(beams: Sequence[Points]) -> bool:
@@ -268,7 +312,8 @@ def are_thinned(beams: Sequence[Points]) -> bool:
     return bool(np.median(gaps_near) > THINNED * np.median(gaps_far))
 
 
-def _elevations(points: Points, height: float) -> FloatArray:
+def elevations_from(points: Points, height: float) -> FloatArray:
+    """Radians (P,) of points (P, 3 or more) as seen from a height in metres above the origin."""
     x, y, z = points[:, :3].T
     elevations: FloatArray = np.arctan2(z - height, np.hypot(x, y))
     return elevations

@@ -10,6 +10,7 @@ import numpy as np
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.beams import Beams
+from rcnn_odom.recordings.laser_frame import MOST_STEEP, cone_spread, find_rise, lowered, steep_part
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.trajectory import read_lines
 from rcnn_odom.recordings.velodyne import (
@@ -33,6 +34,13 @@ FARTHEST = np.float32(1e6)
 SAMPLED_FRAMES = 20
 FRAMES_OF_BEAM = 5
 """So many frames tell where a beam lies whose points come in any order."""
+FEWEST_POINTS = 30
+"""A frame with fewer is blank: that it lacks the beam says nothing about it."""
+MOST_SPREAD = np.deg2rad(0.5)
+"""Of a ring about its cone; KITTI's rings near level have 0.02 degrees."""
+MOST_REFLECTANCE = 2**16
+MOST_ODD = 0.01
+"""Part of the points whose reflectance may be none."""
 
 Scans = dict[int, os.DirEntry[str]]
 """Files by the numbers of their frames."""
@@ -42,7 +50,7 @@ def list_numbered(folder: Path, suffix: str) -> Scans:
     """The files of a folder that are called NUMBER and the suffix, their sizes checked; hidden ones left out.
 
     Raises:
-        InputError: a file has no number or another one's, or is empty or cut off.
+        InputError: a file has no number or another one's, or is empty, cut off or of other points.
     """
     found: Scans = {}
     for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
@@ -53,14 +61,22 @@ def list_numbered(folder: Path, suffix: str) -> Scans:
             raise InputError(
                 f"{entry.path}: scans must be numbered, 000000{suffix} and up, once each; rename it"
             )
-        size = entry.stat().st_size
-        if size == 0 or (suffix == ".bin" and size % POINT_BYTES):
-            raise InputError(
-                f"{entry.path}: {size} bytes are no whole number of {POINT_BYTES}-byte points, so the file "
-                "is empty or cut off; download it again"
-            )
+        if fault := _fault_of_size(entry.stat().st_size, suffix):
+            raise InputError(f"{entry.path}: {fault}")
         found[int(stem)] = entry
     return dict(sorted(found.items()))
+
+
+def _fault_of_size(size: int, suffix: str) -> str | None:
+    if size == 0:
+        return "0 bytes in it, so the file is empty; download it again"
+    if suffix != ".bin" or size % POINT_BYTES == 0:
+        return None
+    fault = f"{size} bytes are no whole number of {POINT_BYTES}-byte points, so the file is cut off"
+    others = [floats for floats in (3, 5) if size % (4 * floats) == 0]
+    if others:
+        fault += f", or has {' or '.join(map(str, others))} 32-bit floats a point, not x y z reflectance"
+    return f"{fault}; download it again" + (" or convert it" if others else "")
 
 
 def file_key(scans: Scans) -> str:
@@ -69,7 +85,9 @@ def file_key(scans: Scans) -> str:
 
 
 def read_points(path: str | Path) -> Points:
-    """The points of a frame, (P, 4 as a rule) float32 metres; what is not finite or absurdly far is left out.
+    """The returns of a frame, (P, 4 as a rule) float32 metres.
+
+    What is not finite, absurdly far or at the origin is left out: so drivers write missing returns.
 
     Args:
         path: ``.bin``, four 32-bit floats a point, or ``.txt``, a line ``x y z reflectance`` for each.
@@ -79,7 +97,7 @@ def read_points(path: str | Path) -> Points:
     """
     if Path(path).suffix == ".txt":
         points = _read_text(path)
-        return points[(np.abs(points[:, :3]) < FARTHEST).all(1)].astype(np.float32)
+        return _without_origin(points[(np.abs(points[:, :3]) < FARTHEST).all(1)].astype(np.float32))
     try:
         values = np.fromfile(path, dtype="<f4")
     except OSError as error:
@@ -88,9 +106,15 @@ def read_points(path: str | Path) -> Points:
         raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
     points = values.reshape(-1, 4)
     if values.max() < FARTHEST and values.min() > -FARTHEST:
-        return points  # the usual file, seen in a tenth of the time
-    # A point that is not finite is how some drivers write a missing return.
-    return points[(np.abs(points[:, :3]) < FARTHEST).all(1)]
+        return _without_origin(points)  # the usual file, seen in a tenth of the time
+    return _without_origin(points[(np.abs(points[:, :3]) < FARTHEST).all(1)])
+
+
+def _without_origin(points: Points) -> Points:
+    at_origin = points[:, 0] == 0
+    if at_origin.any():
+        at_origin &= (points[:, 1] == 0) & (points[:, 2] == 0)
+    return points[~at_origin] if at_origin.any() else points
 
 
 def _read_text(path: str | Path) -> FloatArray:
@@ -129,26 +153,74 @@ def choose_beam(
         ring: which of the lasers, 0 the first in the file. None: the most level one, see ``LEVEL``.
 
     Raises:
-        InputError: a file cannot be read, there is no such ring, or none near level.
+        InputError: a file cannot be read, there is no such ring, or none near level; or the points are not
+            x y z reflectance in the laser's frame.
     """
     files = tuple(map(str, paths))
     frames = np.unique(np.linspace(0, len(files) - 1, SAMPLED_FRAMES).round().astype(int))
-    clouds = [read_points(files[frame]) for frame in frames]
+    clouds = _without_blank([read_points(files[frame]) for frame in frames])
+    if not clouds:
+        raise InputError(f"{files[0]}: neither it nor the other frames have a point; download them again")
+    if files[0].endswith(".bin"):
+        _check_reflectance(clouds, files[0])
+    if ring is None:
+        _check_steepness(clouds, files[0])
     ringed = [rings for cloud in clouds if (rings := split_rings(cloud)) is not None]
     if 2 * len(ringed) < len(clouds):
         disordered = [cloud for cloud in clouds if split_rings(cloud) is None]
         return _by_elevation(files, stamps, ring, disordered)
+    return _by_ring(files, stamps, ring, ringed, len(clouds))
+
+
+def _by_ring(
+    files: tuple[str, ...], stamps: FloatArray, ring: int | None, ringed: list[list[Points]], sampled: int
+) -> tuple["BeamReader", tuple[str, ...]]:
+    rise = find_rise(points for rings in ringed for points in rings)
+    ringed = [[lowered(points, rise) for points in rings] for rings in ringed]
     elevations = _ring_elevations(ringed)
     chosen, elevation = _choose_ring(elevations, ring, files[0])
     usual = [rings[chosen] for rings in ringed if len(rings) == len(elevations) and len(rings[chosen])]
     beam = fit_beam(np.concatenate(usual)) if usual else Beam(elevation)
-    notes = [f"ring {chosen} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"]
-    if others := len(clouds) - len(ringed):
-        notes.append(
-            f"points of {others} in {len(clouds)} frames are not laser by laser; their ring is taken by "
-            "elevation"
+    # A laser with a single beam may be tilted as a whole: there is no other ring that it could be taken for.
+    if ring is None and len(elevations) > 1 and usual and (spread := cone_spread(usual)) > MOST_SPREAD:
+        raise InputError(
+            f"{files[0]}: the points of ring {chosen} lie {np.rad2deg(spread):.1f} degrees from their cone, "
+            "so they are not in the laser's frame; give them in it, or, if it is the ring, set "
+            f"data.ring={chosen} (of rcnn-odom run: --ring {chosen})"
         )
-    return BeamReader(files, tuple(stamps.tolist()), beam, chosen, elevation), tuple(notes)
+    notes = [f"ring {chosen} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"]
+    if rise:
+        notes.append(f"the points were raised: beams meet at {rise:+.2f} m, and rings are told from there")
+    if others := sampled - len(ringed):
+        notes.append(
+            f"points of {others} in {sampled} frames are not laser by laser; their ring is taken by elevation"
+        )
+    return BeamReader(files, tuple(stamps.tolist()), beam, chosen, elevation, rise), tuple(notes)
+
+
+def _without_blank(clouds: list[Points]) -> list[Points]:
+    """The clouds that have about as many points as the others, at least one."""
+    most = max(map(len, clouds))
+    return [cloud for cloud in clouds if len(cloud) > 0 and 100 * len(cloud) >= most]
+
+
+def _check_steepness(clouds: list[Points], path: str) -> None:
+    steep = steep_part(np.concatenate(clouds))
+    if steep > MOST_STEEP:
+        raise InputError(
+            f"{path}: {100 * steep:.0f} % of the points are steeper than 45 degrees, as in a camera's frame; "
+            "give them in the laser's, x ahead and z up"
+        )
+
+
+def _check_reflectance(clouds: list[Points], path: str) -> None:
+    values = np.concatenate([cloud[:, 3] for cloud in clouds])
+    odd = np.mean((values < 0) | (values > MOST_REFLECTANCE))
+    if odd > MOST_ODD:
+        raise InputError(
+            f"{path}: not four 32-bit floats a point (x y z reflectance): the fourth is no reflectance in "
+            f"{100 * odd:.0f} % of them; convert the files"
+        )
 
 
 def _by_elevation(
@@ -216,7 +288,8 @@ class BeamReader:
         stamps: seconds of each.
         beam: where the points of the laser lie.
         ring: number of the laser in the file; None where no frame's points come laser by laser.
-        elevation: median of the ring's, seen from the origin.
+        elevation: median of the ring's, seen from the origin of the lowered points.
+        rise: metres by which the points are lowered to tell rings, see ``laser_frame.find_rise``.
     """
 
     paths: tuple[str, ...]
@@ -224,22 +297,24 @@ class BeamReader:
     beam: Beam
     ring: int | None = None
     elevation: float = float("nan")
+    rise: float = 0.0
 
     def __call__(self, frame: int) -> Scan:
         """Reads one frame.
 
         Raises:
-            InputError: the frame cannot be read or has no such ring.
+            InputError: the frame cannot be read or has no such ring. (A blank one has no returns.)
         """
         path = self.paths[frame]
-        points = read_points(path)
+        points = lowered(read_points(path), self.rise)
         rings = None if self.ring is None else split_rings(points)
         if self.ring is None or rings is None:
-            return Scan.from_points(self._find_points(points, path), self.stamps[frame])
-        if self.ring >= len(rings):
-            raise InputError(
-                f"{path}: frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count "
-                "from 0); choose a smaller data.ring, or download the file again"
+            fault = "its points do not come laser by laser, and none"
+            return Scan.from_points(self._find_points(points, path, fault), self.stamps[frame])
+        if self.ring >= len(rings) or len(points) < FEWEST_POINTS:
+            has = f"frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count from 0)"
+            return Scan.from_points(
+                self._find_points(points, path, f"{has}, and no point"), self.stamps[frame]
             )
         return Scan.from_points(self._find_ring(rings, self.ring), self.stamps[frame])
 
@@ -251,11 +326,11 @@ class BeamReader:
             return rings[number]
         return min(rings[max(number - 1, 0) : number + 2], key=distance)
 
-    def _find_points(self, points: Points, path: str) -> Points:
+    def _find_points(self, points: Points, path: str, fault: str) -> Points:
         found = points_at(points, *self.beam)
-        if len(points) and not len(found):
+        if len(points) >= FEWEST_POINTS and not len(found):
             raise InputError(
-                f"{path}: its points do not come laser by laser, and none is at the "
-                f"{np.rad2deg(self.beam.elevation):+.2f} degrees of the other frames' beam; download it again"
+                f"{path}: {fault} is at the {np.rad2deg(self.beam.elevation):+.2f} degrees of the other "
+                "frames' beam; download it again"
             )
         return found

@@ -8,6 +8,7 @@ from data.make_bag import FORMATS, START, make_cloud_bag
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings import kitti
 from rcnn_odom.recordings.formats import open_stream
+from rcnn_odom.recordings.velodyne import ring_starts
 
 ELEVATIONS = np.arange(-15.0, 16.0, 2.0)
 """Degrees of the 16 rings; 1 is nearest to a hair above level."""
@@ -133,6 +134,59 @@ def test_without_rings_points_are_cut_by_elevation(tmp_path, ring_of_all):
         InputError, match="do not say rings; leave the ring out, or cut at a height with --height"
     ):
         read(bag, ring=3)
+
+
+def moved(cloud, matrix=None, up=0.0):
+    points = np.stack([cloud[name] for name in "xyz"]).astype(float)
+    points = (np.eye(3) if matrix is None else np.array(matrix)) @ points + np.array([[0], [0], [up]])
+    return cloud | {name: values.astype("f4") for name, values in zip("xyz", points, strict=True)}
+
+
+@pytest.mark.parametrize("columns", [None, len(AZIMUTHS)])
+def test_rings_of_a_raised_cloud_are_told_from_where_they_meet(tmp_path, columns):
+    cloud = moved(make_cloud(), up=1.7)
+    layout = {} if columns is None else {"columns": columns}
+    cloud = cloud if columns is None else without(cloud, "ring")
+    stream, [scan] = read(make_cloud_bag(tmp_path, "mcap", [cloud], **layout))
+    check_ring(scan, 0, LEVEL_RING)
+    assert stream.notes[1].endswith("median elevation +1.00 degrees from +1.70 m, where the beams meet")
+
+
+@pytest.mark.parametrize(
+    ("matrix", "says"),
+    [
+        ([[0, -1, 0], [0, 0, -1], [1, 0, 0]], r"\d\d % of the points are steeper than 45 degrees, as in a"),
+        (
+            [[0.94, 0, 0.342], [0, 1, 0], [-0.342, 0, 0.94]],
+            r"the points of ring \d+ lie 1\d\.\d degrees from th",
+        ),
+    ],
+    ids=["optical frame", "tilted by 20 degrees"],
+)
+def test_a_cloud_in_another_frame_is_refused(tmp_path, matrix, says):
+    bag = make_cloud_bag(tmp_path, "mcap", [moved(make_cloud(), matrix)])
+    with pytest.raises(
+        InputError, match=says + r".*; publish it in its laser's frame, or choose --ring N or"
+    ):
+        read(bag)
+    assert len(read(bag, ring=5)[1][0].ranges) == len(AZIMUTHS)
+    assert len(read(bag, height=(-0.5, 0.5))[1][0].ranges) > 0
+
+
+@pytest.mark.parametrize("up", [0.0, 1.7])
+def test_the_ring_of_a_real_laser_on_a_robot(tmp_path, up):
+    root = SHARED / "data" / "kitti"
+    if not root.is_dir():
+        pytest.skip(f"no real recordings at {root}")
+    clouds = []
+    for frame in sorted((root / "sequences" / "90" / "velodyne").glob("*.bin"))[:3]:
+        points = np.fromfile(frame, "<f4").reshape(-1, 4)
+        rings = np.zeros(len(points), "u2")
+        rings[ring_starts(points)[1:]] = 1
+        cloud = dict(zip("xyz", points.T[:3], strict=True)) | {"ring": np.cumsum(rings).astype("u2")}
+        clouds.append(moved(cloud, up=up))
+    stream, _ = read(make_cloud_bag(tmp_path, "mcap", clouds))
+    assert stream.notes[1].split(",")[0] == ("ring 6" if up else "ring 7")
 
 
 @pytest.mark.parametrize("rings", [True, False])

@@ -18,8 +18,12 @@ PLANE = 1e-3
 """Metres between the lowest and the highest point of a laser that has a single plane."""
 SAME_BEAM_DEG = 0.01
 """Bearings closer than this are of one beam, seen twice."""
+MOST_SPREAD = np.deg2rad(1.0)
+"""Of a ring about its cone: in another frame than its laser's it is wider."""
 LEAST_POINTS = 30
 """Of a cut cloud, to tell the spacing of its beams."""
+
+IN_ITS_FRAME = "publish it in its laser's frame, or choose --ring N or --height"
 
 Points: TypeAlias = npt.NDArray[np.floating]
 
@@ -95,7 +99,8 @@ def choose_cut(
 ) -> tuple[Cut, str]:
     """What makes a planar laser's points of each cloud of a recording, and words about it.
 
-    That is the ring nearest to level (see :mod:`rcnn_odom.recordings.velodyne`); of clouds that do not say
+    That is the ring nearest to level (see :mod:`rcnn_odom.recordings.velodyne`), told from where the beams
+    meet if the clouds were raised, as to the base of a robot; of clouds that do not say
     rings, the points at the elevation of the most level beam; of clouds in one plane all.
 
     Args:
@@ -104,7 +109,8 @@ def choose_cut(
         height: metres from and to, in the frame of the cloud: cuts a slice instead.
 
     Raises:
-        ValueError: there is no such ring, no rings, or no beam near level; or ring and height are given.
+        ValueError: there is no such ring, no rings, or no beam near level; ring and height are given; or the
+            clouds are not in the laser's frame.
     """
     if height is not None:
         if ring is not None:
@@ -113,6 +119,8 @@ def choose_cut(
         return lambda cloud: _between(cloud.points, low, high), f"points at heights of {low:g} to {high:g} m"
     if ring is None and all(np.ptp(cloud.points[:, 2]) <= PLANE for cloud in clouds):
         return lambda cloud: cloud.points, "all points, which lie in one plane"
+    if ring is None:
+        _check_steepness(clouds)
     numbering = _find_numbering(clouds)
     if numbering is not None:
         return _cut_ring(clouds, numbering, ring)
@@ -137,6 +145,17 @@ def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
     except ValueError:
         return None
     return Beams(found.first, found.covered, float(np.median(known)))
+
+
+def _check_steepness(clouds: Sequence[Cloud]) -> None:
+    from rcnn_odom.recordings.laser_frame import MOST_STEEP, steep_part
+
+    steep = steep_part(np.concatenate([cloud.points for cloud in clouds]))
+    if steep > MOST_STEEP:
+        raise ValueError(
+            f"{100 * steep:.0f} % of the points are steeper than 45 degrees, as in a camera's frame; "
+            f"{IN_ITS_FRAME}"
+        )
 
 
 def _between(points: Points, low: float, high: float) -> Points:
@@ -164,24 +183,38 @@ def _find_numbering(clouds: Sequence[Cloud]) -> str | None:
 
 def _of_rings(cloud: Cloud, numbering: str, function: Callable[[Points], Any]) -> dict[int, float]:
     """A function of the elevations (P,) in radians of each ring."""
+    rings = _rings_of(cloud, numbering)
+    return {number: float(function(_elevations(points, 0.0))) for number, points in rings.items()}
+
+
+def _rings_of(cloud: Cloud, numbering: str) -> dict[int, Points]:
+    """The points (P, 3) of each ring."""
     rings = cloud.rings[numbering]
     order = np.argsort(rings, kind="stable")
-    x, y, z = cloud.points[order].T.astype(np.float64)
     numbers, starts = np.unique(rings[order], return_index=True)
-    elevations = np.split(np.arctan2(z, np.hypot(x, y)), starts[1:])
-    return {
-        int(number): float(function(of_ring)) for number, of_ring in zip(numbers, elevations, strict=True)
-    }
+    points = np.split(cloud.points[order].astype(np.float64), starts[1:])
+    return dict(zip(map(int, numbers), points, strict=True))
+
+
+def _elevations(points: Points, height: float) -> Points:
+    x, y, z = points.T
+    elevations: Points = np.arctan2(z - height, np.hypot(x, y))
+    return elevations
 
 
 def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tuple[Cut, str]:
+    from rcnn_odom.recordings.laser_frame import cone_spread, find_rise, lowered
     from rcnn_odom.recordings.velodyne import LEVEL, NEAR_LEVEL
 
-    medians: dict[int, list[float]] = {}
+    rings: dict[int, list[Points]] = {}
     for cloud in clouds:
-        for number, elevation in _of_rings(cloud, numbering, np.median).items():
-            medians.setdefault(number, []).append(elevation)
-    elevations = {number: float(np.median(values)) for number, values in medians.items()}
+        for number, points in _rings_of(cloud, numbering).items():
+            rings.setdefault(number, []).append(points)
+    rise = find_rise(points for of_ring in rings.values() for points in of_ring)
+    elevations = {
+        number: float(np.median([np.median(_elevations(points, rise)) for points in of_ring]))
+        for number, of_ring in rings.items()
+    }
     if ring is None:
         ring = min(elevations, key=lambda number: abs(elevations[number] - LEVEL))
         if abs(elevations[ring] - LEVEL) > NEAR_LEVEL:
@@ -189,6 +222,12 @@ def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tupl
                 f"no {numbering} is within 2 degrees of level, the nearest is {ring} at "
                 f"{np.rad2deg(elevations[ring]):+.1f}; choose one with --ring, or cut at a height with "
                 "--height"
+            )
+        spread = cone_spread([lowered(points, rise) for points in rings[ring]])
+        if spread > MOST_SPREAD:
+            raise ValueError(
+                f"the points of {numbering} {ring} lie {np.rad2deg(spread):.1f} degrees from their cone, so "
+                f"the cloud is not in its laser's frame; {IN_ITS_FRAME}"
             )
     elif ring not in elevations:
         raise ValueError(
@@ -202,7 +241,8 @@ def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tupl
             raise ValueError(f"it has no {numbering}s")
         return cloud.points[cloud.rings[numbering] == chosen]
 
-    return cut, f"{numbering} {ring}, median elevation {np.rad2deg(elevations[ring]):+.2f} degrees"
+    seen_from = f" from {rise:+.2f} m, where the beams meet" if rise else ""
+    return cut, f"{numbering} {ring}, median elevation {np.rad2deg(elevations[ring]):+.2f} degrees{seen_from}"
 
 
 def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
