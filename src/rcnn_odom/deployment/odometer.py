@@ -208,18 +208,7 @@ class Odometer:
         if not depth.any():
             self._missed += tick.periods
             return self._hold(stamp, tick.periods, notes)
-        earlier, gap = self._earlier, tick.periods + self._missed
-        self._earlier, self._missed = depth, 0
-        if gap > 1:
-            notes.append(f"gap: {gap} periods after the last scan, the last motion goes on")
-            return self._hold(stamp, tick.periods, notes)
-        step = self._stepper(np.stack([earlier, depth]))
-        if not np.isfinite(step.array()).all():
-            self._stepper.reset()  # its state is nan as well
-            return self._hold(stamp, tick.periods, [*notes, "no estimate: the last motion goes on"])
-        self._motion, self._held = step.array(), 0
-        self.estimates += 1
-        return self._move(stamp, step, notes)
+        return self._compare(self._earlier, depth, stamp, tick.periods, notes)
 
     def returns(self) -> npt.NDArray[np.float32]:
         """Points (P, 2) of the last scan in the frame of the first one: its bins with a return.
@@ -277,6 +266,28 @@ class Odometer:
         self._beams, self._spacing = count, spacing
         same = not before or abs(spacing - last) < SAME_SPACING * last
         return [] if same else [f"beam count: {count} after {before}"]
+
+    def _compare(
+        self,
+        earlier: npt.NDArray[np.float32],
+        depth: npt.NDArray[np.float32],
+        stamp: float | None,
+        periods: int,
+        notes: list[str],
+    ) -> Pose:
+        """The pose at a scan that is compared with the last one with returns, if that is a period ago."""
+        gap = periods + self._missed
+        self._earlier, self._missed = depth, 0
+        if gap > 1:
+            notes.append(f"gap: {gap} periods after the last scan, the last motion goes on")
+            return self._hold(stamp, periods, notes)
+        step = self._stepper(np.stack([earlier, depth]))
+        if not np.isfinite(step.array()).all():
+            self._stepper.reset()  # its state is nan as well
+            return self._hold(stamp, periods, [*notes, "no estimate: the last motion goes on"])
+        self._motion, self._held = step.array(), 0
+        self.estimates += 1
+        return self._move(stamp, step, notes)
 
     def _begin(self, depth: npt.NDArray[np.float32], stamp: float | None, notes: list[str]) -> Pose:
         """A pose without motion: at the start, which is certain, or where nobody knows how far it went."""
