@@ -20,7 +20,9 @@ CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 LZ4 = CompressionType.LZ4
 
 
-def make_bag(folder: Path, kind: str, ranges: np.ndarray, topics=("/scan",), field_of_view_deg=180.0) -> Path:
+def make_bag(
+    folder: Path, kind: str, ranges: np.ndarray, topics=("/scan",), field_of_view_deg=180.0, **changes
+) -> Path:
     """Writes scans (N, beams) at 10 Hz on each topic, and a string topic beside them; the bag's path."""
     first = kind == "ros1"
     store = store_of(kind)
@@ -28,7 +30,7 @@ def make_bag(folder: Path, kind: str, ranges: np.ndarray, topics=("/scan",), fie
         (
             topic,
             arrival_of(number),
-            laser_scan(store, row, START + 0.1 * number, field_of_view_deg, first, number),
+            laser_scan(store, row, START + 0.1 * number, field_of_view_deg, first, number, **changes),
         )
         for number, row in enumerate(ranges)
         for topic in topics

@@ -171,9 +171,9 @@ def test_a_clockwise_laser() -> None:
 def test_other_messages_of_rosbridge_are_counted(caplog: pytest.LogCaptureFixture) -> None:
     lines = [
         {"op": "status", "level": "info", "msg": "subscribed"},
-        {"op": "publish", "topic": "/front", "msg": laser_scan(ranges=[1, 2])},
-        {"op": "publish", "topic": "/back", "msg": laser_scan(ranges=[3, 4])},
-        {"op": "publish", "topic": "/front", "msg": laser_scan(ranges=[5, 6])},
+        {"op": "publish", "topic": "/front", "msg": laser_scan(ranges=[1, 2], angle_max=-0.25)},
+        {"op": "publish", "topic": "/back", "msg": laser_scan(ranges=[3, 4], angle_max=-0.25)},
+        {"op": "publish", "topic": "/front", "msg": laser_scan(ranges=[5, 6], angle_max=-0.25)},
         {"op": "service_response", "values": {}},
         {"op": "publish", "topic": "/front", "msg": "text"},
         {"op": None},

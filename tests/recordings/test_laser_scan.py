@@ -1,11 +1,13 @@
 """LaserScan messages as scans: their limits, angles, and readings that are no returns."""
 
+import json
 import math
 
 import numpy as np
 import pytest
 
-from rcnn_odom.recordings.laser_scan import from_laser_scan, has_most_beyond
+from rcnn_odom.recordings.json_lines import stream_lines
+from rcnn_odom.recordings.laser_scan import compare_angles, from_laser_scan, has_most_beyond
 
 NAN, INF = math.nan, math.inf
 
@@ -81,3 +83,38 @@ def test_times_of_beams(increment, times):
     scan = from_laser_scan(np.ones(3), 0.0, 0.1, time_increment=increment, stamp=2.5, frame_id="laser")
     np.testing.assert_array_equal(scan.times, times)
     assert (scan.stamp, scan.frame_id) == (2.5, "laser")
+
+
+@pytest.mark.parametrize(
+    ("angles", "count", "told"),
+    [
+        ((-1.5708, 0.0174533, 1.5708), 181, ""),
+        ((-1.5708, 0.0174533, 1.5708), 180, ""),  # the last beam is left out
+        ((1.5708, -0.0174533, -1.5708), 181, ""),
+        ((-1.5708, 0.0174533, 0.0), 181, ""),  # not set
+        ((-1.5708, 0.0174533, math.nan), 181, ""),
+        ((-1.5708, 0.0, 1.5708), 181, ""),
+        ((-1.5708, 0.00872665, 1.5708), 181, "cover 180 degrees, its angle_increment and 181 readings 90;"),
+        ((-1.5708, 0.0174533, 1.5708), 91, "cover 180 degrees, its angle_increment and 91 readings 90;"),
+    ],
+)
+def test_angles_that_contradict_each_other(angles, count, told):
+    assert told in (contradiction := compare_angles(*angles, count))
+    assert bool(contradiction) == bool(told)
+
+
+def test_a_contradiction_of_a_bag_is_told_once(caplog, tmp_path):
+    bag = make_bag(tmp_path, "mcap", np.full((5, 181), 3.0), angle_max=0.5)
+    assert len(list(rosbag.stream(bag).scans)) == 5
+    assert [
+        message for message in caplog.messages if "/scan: its angle_max says" in message
+    ] == caplog.messages
+    assert len(caplog.messages) == 1
+
+
+def test_a_contradiction_is_told_once(caplog):
+    line = {"ranges": [2.0] * 91, "angle_min": -1.5708, "angle_increment": 0.0174533, "angle_max": 1.5708}
+    scans = list(stream_lines([json.dumps(line)] * 5).scans)
+    np.testing.assert_allclose(scans[4].bearings[-1], 0, atol=1e-4)
+    assert [message for message in caplog.messages if "its angle_max says" in message] == caplog.messages
+    assert len(caplog.messages) == 1

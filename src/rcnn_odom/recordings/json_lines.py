@@ -22,7 +22,7 @@ import numpy as np
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.broken_lines import BrokenLines
-from rcnn_odom.recordings.laser_scan import from_laser_scan
+from rcnn_odom.recordings.laser_scan import compare_angles, from_laser_scan
 from rcnn_odom.recordings.packing import read_head
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
@@ -82,7 +82,7 @@ def _stream(lines: Iterable[str], name: str, topic: str | None, is_live: bool) -
 
 def _scans(lines: Iterable[str], broken: BrokenLines, wanted: str | None) -> Iterator[Scan]:
     skipped = broken.skipped
-    chosen, others, count = wanted, set[str](), 0
+    chosen, others, count, contradiction = wanted, set[str](), 0, ""
     for number, line in enumerate(lines, start=1):
         line = line.lstrip(MARK)
         if not line.strip():
@@ -102,9 +102,19 @@ def _scans(lines: Iterable[str], broken: BrokenLines, wanted: str | None) -> Ite
             continue
         chosen, count = topic if chosen is None else chosen, count + 1
         broken.tell()
+        contradiction = contradiction or _tell_contradiction(broken.name, message, len(scan.ranges))
         yield scan
     if not count and skipped:
         raise InputError(_why_no_scan(broken, wanted, others))
+
+
+def _tell_contradiction(name: str, message: JSONObject, count: int) -> str:
+    """What a message's angles say against each other, told; empty where they agree."""
+    angles = None if message.get("points") is not None else _angles(message)
+    contradiction = compare_angles(*angles, count) if angles else ""
+    if contradiction:
+        log.warning("%s: %s", name, contradiction)
+    return contradiction
 
 
 def _is_other(topic: str | None, chosen: str | None, wanted: str | None) -> bool:

@@ -8,6 +8,8 @@ import numpy.typing as npt
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.scan import Scan
 
+ANGLES_AGREE = 2.0
+"""Beams by which angle_max may be off: drivers count the last one differently."""
 NO_RETURN_CODE = 0.98
 """Of the largest reading: what lies above is at the constant that a laser writes where nothing came back."""
 
@@ -61,6 +63,22 @@ def from_laser_scan(
         times=time_increment * beam if 0 < time_increment < np.inf else None,
         stamp=stamp,
         frame_id=frame_id,
+    )
+
+
+def compare_angles(angle_min: float, angle_increment: float, angle_max: float, count: int) -> str:
+    """What a message's angles (radians) say against each other, for a user; empty where they agree.
+
+    An angle_max of 0 or nan was not set.
+    """
+    covered, said = angle_increment * (count - 1), angle_max - angle_min
+    if count < 2 or not angle_increment or not angle_max:
+        return ""
+    if not abs(covered - said) > ANGLES_AGREE * abs(angle_increment):  # not so of nan
+        return ""
+    return (
+        f"its angle_max says that the beams cover {math.degrees(said):.4g} degrees, its angle_increment and "
+        f"{count} readings {math.degrees(covered):.4g}; the latter count"
     )
 
 

@@ -4,6 +4,7 @@ Only the topic that is asked for is looked at, and its messages are read by the 
 what a bag says about other topics, or about its types, cannot keep it from being read.
 """
 
+import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
@@ -19,10 +20,12 @@ from rcnn_odom.recordings.bags.chunks import BrokenBag
 from rcnn_odom.recordings.bags.files import MENDED_BY, METADATA, Bag, is_bag, open_bag
 from rcnn_odom.recordings.bags.point_cloud import PLANE, Cloud, choose_cut, estimate_beams, read_cloud
 from rcnn_odom.recordings.bags.topics import LASER_SCAN, Topic, choose_topic, short_name
-from rcnn_odom.recordings.laser_scan import from_laser_scan
+from rcnn_odom.recordings.laser_scan import compare_angles, from_laser_scan
 from rcnn_odom.recordings.packing import import_zstd
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
+
+log = logging.getLogger(__name__)
 
 SAMPLED_CLOUDS = 20
 UNREADABLE = "messages that cannot be read"
@@ -122,10 +125,16 @@ def _stream_lasers(
             f"{path}: {topic.name} holds LaserScan messages, of which there is no {given} to choose; leave "
             f"--{given} out, or choose a topic with PointCloud2 messages with --topic"
         )
-    skipped, clock = Counter[str](), _Clock()
+    skipped, clock, told = Counter[str](), _Clock(), list[str]()
 
     def to_scan(message: Any, arrival: int) -> Scan:
-        return replace(convert(message), stamp=clock.stamp(message, arrival))
+        scan = replace(convert(message), stamp=clock.stamp(message, arrival))
+        if not told:
+            first, step, last = map(float, (message.angle_min, message.angle_increment, message.angle_max))
+            if contradiction := compare_angles(first, step, last, len(scan.ranges)):
+                log.warning("%s: %s: %s", path, topic.name, contradiction)
+                told.append(contradiction)
+        return scan
 
     return ScanStream(
         name=_name_of(path),
