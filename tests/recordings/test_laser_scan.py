@@ -6,6 +6,8 @@ import math
 import numpy as np
 import pytest
 
+from data.make_bag import make_bag
+from rcnn_odom.recordings import rosbag
 from rcnn_odom.recordings.json_lines import stream_lines
 from rcnn_odom.recordings.laser_scan import compare_angles, from_laser_scan, has_most_beyond
 
