@@ -897,13 +897,13 @@ def test_cases_that_are_refused(cases: Path, name: str, match: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "sensor"),
+    ("name", "sensor", "most"),
     [
-        ("robotlaser_neg_res", Sensor(1.0, 180.0, 40.0)),
-        ("flaser_541_param", Sensor(0.5, 270.0, 40.0)),
+        ("robotlaser_neg_res", Sensor(1.0, 180.0, 40.0), 0.11),
+        ("flaser_541_param", Sensor(0.5, 270.0, 40.0), 0.085),
     ],
 )
-def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, sensor: Sensor) -> None:
+def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, sensor: Sensor, most: float) -> None:
     log = carmen.load(name, root=cases)
     scans = np.stack([sensor.encode(log.read_scan(frame)) for frame in range(len(log))])
     drive = Drive(name, "", scans, log.poses, log.stamps, FORWARD_CAMERA)
@@ -911,7 +911,7 @@ def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, sensor: Se
     found = change_frame(icp.estimate(drive).poses(), FORWARD_CAMERA)
     assert icp.failures == {name: 0}
     score = drift(drive.camera_poses, found, planar=True, lengths=[1.0, 2.0, 5.0, 10.0])
-    assert score.t_err < 0.12
+    assert score.t_err < most
     for frame, scan in enumerate(carmen.stream(cases / f"{name}.log.gz").scans):
         np.testing.assert_array_equal(scan.bearings, log.read_scan(frame).bearings)
 

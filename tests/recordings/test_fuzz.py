@@ -5,7 +5,9 @@
 
 import json
 import shutil
+import sqlite3
 from collections import Counter
+from contextlib import closing
 from dataclasses import replace
 
 import numpy as np
@@ -14,7 +16,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from data.make_bag import CLOUD, SCAN, make_bag, point_cloud, scan_bytes, store_of, write_mcap, write_ros1
-from data.make_carmen import PACKINGS, make_carmen
+from data.make_carmen import PACKINGS, make_carmen, write_log
 from data.make_kitti import make_kitti, make_kitti_raw
 from data.point_orders import PERMUTED, RINGED, THINNED
 from odometry import ANGLES
@@ -25,6 +27,7 @@ from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings import carmen, json_lines, kitti, kitti_raw, rosbag
 from rcnn_odom.recordings.beams import BeamCheck, find_beams
+from rcnn_odom.recordings.formats import open_stream
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.trajectory import read_kitti
 from scans import beams
@@ -628,3 +631,113 @@ def test_bags_of_several_files(bags, data, kind, place):
     (bag / f"{place}.db3").write_bytes(data.draw(damaged(content) | st.binary(max_size=300)))
     scans = stream_bag(bag, topic="/scan")
     assert len(scans) >= 12
+
+
+def write_mutated(folder, kind, scans, angles, stamps, definition):
+    """A recording of scans (N, P), of angles (first, increment) in radians and stamps (N,), and garbage.
+
+    Its path. What the format does not hold, as a definition of messages, is left out.
+    """
+    first, step = angles
+    ends = {"angle_min": first, "angle_increment": step, "angle_max": first + step * (scans.shape[1] - 1)}
+    laser = {"range_max": 1e4, **ends}
+    if kind == "json":
+        lines = [
+            {"stamp": stamp, "ranges": row.tolist(), **laser}
+            for row, stamp in zip(scans, stamps, strict=True)
+        ]
+        return write_log(folder / "mutated.jsonl", [json.dumps(line) for line in lines])
+    if kind == "ROBOTLASER1":
+        head = f"0 {first:.9f} {abs(step) * scans.shape[1]:.9f} {step:.9f} 10000 0.01 0 {scans.shape[1]}"
+        pose = "0 0 0 0 0 0 0 0 0.3 0.3 1e6"
+        rows = [" ".join(f"{value:.3f}" for value in row) for row in scans]
+        lines = [
+            f"ROBOTLASER1 {head} {row} 0 {pose} {stamp:.6f} nohost 0"
+            for row, stamp in zip(rows, stamps, strict=True)
+        ]
+        return write_log(folder / "mutated.log", lines)
+    is_ros1 = kind == "ros1"
+    contents = [
+        scan_bytes(row, stamp, ros1=is_ros1, **laser) for row, stamp in zip(scans, stamps, strict=True)
+    ]
+    arrivals = [10**9 + 10**8 * number for number in range(len(scans))]
+    if is_ros1:
+        connections = [
+            (b"/scan", b"sensor_msgs/LaserScan", definition),
+            (b"/x", b"foreign/Type", definition),
+        ]
+        messages = [(0, *each) for each in zip(arrivals, contents, strict=True)] + [(1, 10**9, definition)]
+        return write_ros1(folder / "mutated", connections, messages)
+    if kind == "mcap":
+        channels = {
+            "/scan": (SCAN, "ros2msg", definition, "cdr"),
+            "/x": ("foreign/Type", "protobuf", definition, "protobuf"),
+        }
+        messages = [("/scan", *each) for each in zip(arrivals, contents, strict=True)]
+        return write_mcap(folder / "mutated", channels, [*messages, ("/x", 10**9, definition)])
+    return write_sqlite(folder / "mutated", contents, arrivals, definition)
+
+
+def write_sqlite(path, contents, arrivals, definition):
+    path.unlink(missing_ok=True)
+    with closing(sqlite3.connect(path)) as database, database:
+        database.execute("CREATE TABLE topics(id INTEGER, name TEXT, type TEXT, serialization_format TEXT)")
+        database.execute("CREATE TABLE message_definitions(topic_type TEXT, encoded_message_definition TEXT)")
+        database.execute("CREATE TABLE messages(id INTEGER, topic_id INTEGER, timestamp INTEGER, data BLOB)")
+        topics = [(1, "/scan", SCAN, "cdr"), (2, "/x", definition, "protobuf")]
+        database.executemany("INSERT INTO topics VALUES (?, ?, ?, ?)", topics)
+        database.execute("INSERT INTO message_definitions VALUES (?, ?)", (SCAN, definition))
+        rows = [(n, 1, *each) for n, each in enumerate(zip(arrivals, contents, strict=True))]
+        database.executemany(
+            "INSERT INTO messages VALUES (?, ?, ?, ?)", [*rows, (99, 2, arrivals[0], definition)]
+        )
+    return path
+
+
+@given(
+    data=st.data(),
+    kind=st.sampled_from(["ros1", "sqlite3", "mcap", "json", "ROBOTLASER1"]),
+    mutation=st.sampled_from(["none", "clockwise", "half", "left", "degrees", "centimetres"]),
+    definition=st.binary(max_size=60),
+    jump=st.sampled_from([0.0, 3.0, 11.0, 3600.0, -11.0, -1e6]),
+    at=st.integers(1, 7),
+)
+def test_mutations_through_every_reader(logs_folder, data, kind, mutation, definition, jump, at):
+    """Order, extent, unit and clock of scans, and foreign definitions, as they come out of each reader."""
+    CASES["mutated recordings"] += 1
+    scans, (first, step) = np.tile(np.linspace(2, 9, 181), (8, 1)), np.deg2rad([-90.0, 1.0])
+    if mutation == "clockwise":
+        first, step = -first, -step
+    elif mutation == "half":
+        scans = scans[:, :91]
+    elif mutation == "left":
+        first = 0.0
+    elif mutation == "degrees":
+        first, step = -90.0, 1.0
+    elif mutation == "centimetres":
+        scans = 100 * scans
+    stamps = 2e6 + 0.1 * np.arange(8) + jump * (np.arange(8) >= at)
+    path = write_mutated(logs_folder, kind, scans, (first, step), stamps.tolist(), definition)
+    stream = try_all("mutated recordings opened", open_stream, path)
+    assert stream is not None
+    odometer, poses = Odometer(Straight()), []
+    try:
+        for scan in stream.scans:
+            poses.append(odometer.step(scan if stream.has_clock else replace(scan, stamp=None)))
+    except InputError as error:
+        check_error(error)
+        assert (kind, mutation) == ("ROBOTLASER1", "degrees"), "of the other readers nothing is refused"
+        return
+    assert len(poses) == 8, "no scan is lost, whatever else the recording holds"
+    fits = mutation in ("none", "clockwise")
+    assert all(("other laser" in pose.degraded) != fits for pose in poses)
+    jumps = fits and stream.has_clock and abs(jump) > 10
+    assert ("clock set" in poses[at].degraded) == (stream.has_clock and abs(jump) > 10)
+    assert odometer.estimates == (0 if not fits else 6 if jumps or (stream.has_clock and jump == 3.0) else 7)
+    if jumps:
+        assert poses[at].x == poses[at - 1].x
+
+
+@pytest.fixture(scope="module")
+def logs_folder(tmp_path_factory):
+    return tmp_path_factory.mktemp("mutated")

@@ -11,14 +11,14 @@ REMEMBERED = 15
 FOLLOWING = 0.2
 """Part of a stamp's jitter that the expected time of the next scan follows."""
 FOREVER = 1e9
-"""Periods that no longer differ; a wild stamp is farther away than an integer can tell."""
+"""Upper bound on the number of lost periods, so that it fits an integer."""
 SLOW = 1.5
 """Times the period of training from which on steps are longer than a network knows."""
 LATE_IN_A_ROW = 5
 """After so many late scans it is the clock that has been set."""
 COARSE = 5
 """After so many scans with the stamp of the one before such a stamp no longer means a late scan."""
-WILD = 5
+JUMPS_IN_A_ROW = 5
 """After so many jumps in a row the stamps tell nothing."""
 CLOCK_JUMP = 10.0
 """Seconds from one stamp to the next, forward or back, from which on a clock has been set."""
@@ -84,7 +84,7 @@ class Clock:
 
     def _is_no_time(self, stamp: float, repeats: bool) -> bool:
         """Whether a stamp says nothing: one of a coarse or wild clock, or the 0 of a driver that has none."""
-        if self._jumps >= WILD or (stamp == self._stamp and self._equal >= COARSE and not repeats):
+        if self._jumps >= JUMPS_IN_A_ROW or (stamp == self._stamp and self._equal >= COARSE and not repeats):
             return True
         return stamp == 0 and self._stamp is not None and (self._stamp == 0 or abs(self._stamp) > CLOCK_JUMP)
 
@@ -98,8 +98,8 @@ class Clock:
         self._begin(stamp)
         self._jumps += 1
         told = f"{CLOCK_SET}: from {was:.15g} to {stamp:.15g} s, no motion is added"
-        if self._jumps == WILD:
-            told += f", for the {WILD}th time in a row: from here on stamps do not count"
+        if self._jumps == JUMPS_IN_A_ROW:
+            told += f", for the {JUMPS_IN_A_ROW}th time in a row: from here on stamps do not count"
         return Tick(clock_set=told)
 
     def _count_late(self, stamp: float) -> Tick:

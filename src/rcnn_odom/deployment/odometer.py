@@ -29,7 +29,7 @@ PASSED_OVER = (LATE, OTHER_FRAME)
 
 
 def _no_step() -> Step:
-    """Where the pose does not change, and that is certain: at the origin, and where it is told again."""
+    """A zero step with zero covariance, for the first pose and for repeated poses."""
     return Step(0.0, 0.0, 0.0, np.zeros((3, 3)))
 
 
@@ -213,7 +213,7 @@ class Odometer:
     def returns(self) -> npt.NDArray[np.float32]:
         """Points (P, 2) of the last scan in the frame of the first one: its bins with a return.
 
-        None where the last scan had no return or was passed over as late.
+        Empty if the last scan had no return or was not used.
         """
         if self._present is None:
             return np.empty((0, 2), np.float32)

@@ -76,7 +76,7 @@ def run(
                     folder.add(pose)
                 if on_pose:
                     on_pose(pose)
-            statistics.need_a_use()
+            statistics.require_usable_scans()
         except BaseException as error:
             statistics.stopped = str(error) or type(error).__name__
             raise
@@ -137,7 +137,7 @@ class Statistics:
         # A scan that was passed over keeps the stamp of the pose that it repeats.
         return pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
 
-    def need_a_use(self) -> None:
+    def require_usable_scans(self) -> None:
         """Looks at the end whether anything could be used.
 
         Raises:
@@ -163,6 +163,7 @@ class Statistics:
             "model": self.model,
             "scans": self.scans,
             "path_m": self.path,
+            "notes": list(self.stream.notes),
             "degraded": dict(self.degraded),
             "skipped": dict(self.stream.skipped),
             "latency": {"median_ms": median, "p99_ms": p99, "max_ms": self.longest},

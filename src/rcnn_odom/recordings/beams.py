@@ -17,8 +17,8 @@ WIDEST_GAP = 3.0
 """Beam spacings: a laser whose beams leave no wider gap turns all round."""
 CLOSEST, FARTHEST = 0.3, 2.05
 """Bins between two beams: from 0.5 degrees for bins of 1, to a Velodyne's 0.18 for bins of 0.1."""
-WILD = 1e6
-"""Radians that are no angle of anything."""
+LARGEST_ANGLE = 1e6
+"""Radians; larger numbers are no angles."""
 FAR = 100.0
 """Metres: no planar laser has most of its returns from farther away."""
 RESOLUTIONS_DEG = (0.02, 0.05, 0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
@@ -70,13 +70,12 @@ class Beams(NamedTuple):
         resolution = min((r for r in RESOLUTIONS_DEG if r > 0.99 * self.spacing), default=RESOLUTIONS_DEG[-1])
         if not CLOSEST * resolution < self.spacing < FARTHEST * resolution:
             return ""
-        covered, middle = self.covered, self.middle
-        if round(covered + self.spacing, 1) % 5 == 0:  # the last beam of, say, 180 degrees is left out
-            covered, middle = covered + self.spacing, middle + self.spacing / 2
+        covered = self.covered
+        if round(covered + self.spacing, 1) % 5 == 0:  # the beam at one end of, say, 180 degrees is left out
+            covered += self.spacing
         width = min(max(1, round(covered / resolution)) * resolution, 360.0)
-        facing = (
-            round(_wrap(middle), 1) if width < 360 and abs(middle) > max(resolution, self.spacing) else 0.0
-        )
+        is_aside = width < 360 and abs(self.middle) > max(resolution, self.spacing)
+        facing = round(self.middle, 1) if is_aside else 0.0
         return (
             f"data.sensor.field_of_view_deg={width:g} data.sensor.resolution_deg={resolution:g} "
             f"data.sensor.facing_deg={facing:g}"
@@ -94,7 +93,7 @@ def find_beams(bearings: FloatArray) -> Beams:
     Raises:
         ValueError: the bearings are not finite, all the same, or go round the circle more than once.
     """
-    if not (np.abs(bearings) < WILD).all():
+    if not (np.abs(bearings) < LARGEST_ANGLE).all():
         raise ValueError("the bearings of its beams are not finite, or wild")
     degrees = np.rad2deg(bearings)
     extent = float(np.ptp(degrees))
@@ -146,7 +145,7 @@ def compare_ranges(ranges: FloatArray) -> str:
 class BeamCheck:
     """Compares the scans of one laser with a sensor, scan after scan.
 
-    Scans of returns alone, which do not tell of the laser's beams, and scans without a reading fit always.
+    Scans that list only their returns (``has_all_beams`` is false), and scans without a reading, always fit.
 
     Args:
         sensor: what the scans are encoded for.
@@ -163,7 +162,7 @@ class BeamCheck:
         self.fitting, self.misfitting, self.in_a_row, self.reason = 0, 0, 0, ""
         self.beams: Beams | None = None
         self._seen: object = None
-        self._of_beams, self._frame = "", ""
+        self._beam_reason, self._frame = "", ""
 
     @property
     def is_for_good(self) -> bool:
@@ -190,7 +189,7 @@ class BeamCheck:
             remedy: what the user can do where the beams are the reason, ``{}`` for the options of a sensor
                 that they fit.
         """
-        beams = self.beams if self._of_beams else None
+        beams = self.beams if self._beam_reason else None
         advice = "correct the recording: metres, and radians between its beams"
         if beams and (options := beams.sensor_options()):
             advice = remedy.format(options)
@@ -206,8 +205,8 @@ class BeamCheck:
         if seen != self._seen:
             self._frame = f" (frame {scan.frame_id})" if scan.frame_id else ""
             self._seen = seen
-            self._of_beams = self._judge(scan)
-        return self._of_beams
+            self._beam_reason = self._judge(scan)
+        return self._beam_reason
 
     def _judge(self, scan: Scan) -> str:
         width = self.sensor.field_of_view_deg

@@ -181,7 +181,7 @@ def _why_no_scan(path: Path, kinds: str, broken: BrokenLines, others: Counter[st
     if broken.count:
         return (
             f"{path}: none of its {broken.count} {kinds} lines can be used; the first, {broken.first}; "
-            "correct them"
+            "correct what they say of the laser"
         )
     found = f", only {', '.join(sorted(others))}" if others else ""
     return f"{path}: no FLASER or ROBOTLASER1 line in it{found}; convert the log to one of them"

@@ -98,7 +98,9 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
         InputError: nothing of the kind, or it cannot be read.
     """
     if not path.exists():
-        raise InputError(f"{path}: no such file or folder; give a KITTI sequence, a CARMEN log or a ROS bag")
+        raise InputError(
+            f"{path}: no such file or folder; give a KITTI drive, a CARMEN log, a ROS bag or JSON lines"
+        )
     if not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: is a pipe or device; give a file, or --live for JSON lines")
     for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, ASKED_LAST)):

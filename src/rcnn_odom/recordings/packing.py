@@ -57,10 +57,7 @@ def open_unpacked(path: Path) -> BinaryIO:
         InputError: it cannot be read, or is an archive of files or a pointer of Git LFS.
     """
     head = _first_bytes(path)
-    if head.startswith(LFS_POINTER):
-        raise InputError(
-            f"{path}: is a pointer of Git LFS, not the recording itself; fetch it with git lfs pull"
-        )
+    refuse_pointer(path, head)
     for magic, kind in ARCHIVES.items():
         if head.startswith(magic):
             raise InputError(f"{path}: is {kind}; unpack it and give the recording in it")
@@ -69,6 +66,16 @@ def open_unpacked(path: Path) -> BinaryIO:
         return file
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
+
+
+def refuse_pointer(path: str | Path, head: bytes) -> None:
+    """Refuses what Git LFS leaves in place of a large file that it has not fetched.
+
+    Raises:
+        InputError: the first bytes of the file are those of such a pointer.
+    """
+    if head.startswith(LFS_POINTER):
+        raise InputError(f"{path}: is a pointer of Git LFS, not the file itself; fetch it with git lfs pull")
 
 
 def _open_plain(path: Path) -> BinaryIO:

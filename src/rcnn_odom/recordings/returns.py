@@ -28,7 +28,7 @@ class AbsentReturns:
         self.kinds["are 0, negative, nan, or below their laser's minimum"] += int((~(ranges > 0)).sum())
 
     def __str__(self) -> str:
-        """A sentence without its end."""
+        """A sentence without a full stop; advice is appended."""
         kinds = [f"{count} {kind}" for kind, count in self.kinds.most_common() if count]
         found = f"of their readings {', '.join(kinds)}" if kinds else "they hold no readings"
         return f"none of its {self.scans} scans has a return: {found}"

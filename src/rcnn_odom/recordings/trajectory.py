@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.recordings.packing import HEAD
+from rcnn_odom.recordings.packing import HEAD, refuse_pointer
 from rcnn_odom.recordings.text import refuse_utf16
 
 
@@ -59,12 +59,13 @@ def read_lines(path: str | Path, wanted: str) -> list[str]:
         wanted: what it should be, for the message.
 
     Raises:
-        InputError: it cannot be read, is empty, or is text in UTF-16.
+        InputError: it cannot be read, is empty, is text in UTF-16, or a pointer of Git LFS.
     """
     try:
         content = Path(path).read_bytes()
     except OSError as error:
         raise InputError(f"{path}: cannot be read: {error.strerror}; {wanted}") from error
+    refuse_pointer(path, content[:HEAD])
     refuse_utf16(path, content[:HEAD])
     lines = content.decode("utf-8-sig", errors="replace").rstrip().splitlines()
     if not lines:

@@ -197,7 +197,7 @@ def _slope_over(closeness: FloatArray, slope: FloatArray, highest: float) -> flo
 
 
 def median_elevation(points: Points) -> float:
-    """Of a ring's points (P, 3) seen from the origin, in radians; nan of no points."""
+    """The median elevation of points (P, 3), seen from the origin, in radians; nan if there are none."""
     return float(np.median(elevations_from(points, 0.0))) if len(points) else float("nan")
 
 

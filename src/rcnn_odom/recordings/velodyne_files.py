@@ -11,6 +11,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.beams import Beams
 from rcnn_odom.recordings.laser_frame import MOST_STEEP, cone_spread, find_rise, lowered, steep_part
+from rcnn_odom.recordings.packing import refuse_pointer
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.trajectory import read_lines
 from rcnn_odom.recordings.velodyne import (
@@ -28,6 +29,8 @@ from rcnn_odom.recordings.velodyne import (
 )
 
 POINT_BYTES = 16
+LARGEST_POINTER = 1024
+"""Bytes of a pointer of Git LFS, at most."""
 VELODYNE = Beams(first=-180.0, covered=360.0, spacing=0.18)
 FARTHEST = np.float32(1e6)
 """Metres: what claims to be farther away is no return."""
@@ -61,7 +64,10 @@ def list_numbered(folder: Path, suffix: str) -> Scans:
             raise InputError(
                 f"{entry.path}: scans must be numbered, 000000{suffix} and up, once each; rename it"
             )
-        if fault := _fault_of_size(entry.stat().st_size, suffix):
+        size = entry.stat().st_size
+        if size < LARGEST_POINTER:
+            refuse_pointer(entry.path, Path(entry.path).read_bytes())
+        if fault := _fault_of_size(size, suffix):
             raise InputError(f"{entry.path}: {fault}")
         found[int(stem)] = entry
     return dict(sorted(found.items()))

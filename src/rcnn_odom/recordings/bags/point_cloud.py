@@ -130,7 +130,7 @@ def choose_cut(
 
 
 def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
-    """Where the beams lie that points are left of; None: the points do not tell.
+    """The beams of which these points are the remaining returns; None: the points do not tell.
 
     What the laser covers is told by all points of the clouds, since one ring may have no return in a part.
     """

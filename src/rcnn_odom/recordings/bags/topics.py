@@ -88,7 +88,7 @@ def _name_all(topics: list[Topic]) -> str:
 
 
 def short_name(kind: str) -> str:
-    """Of a type of messages.
+    """The last part of a message type's name.
 
     >>> short_name(LASER_SCAN)
     'LaserScan'
