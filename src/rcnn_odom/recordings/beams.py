@@ -75,7 +75,8 @@ class Beams(NamedTuple):
             covered += self.spacing
         width = min(max(1, round(covered / resolution)) * resolution, 360.0)
         is_aside = width < 360 and abs(self.middle) > max(resolution, self.spacing)
-        facing = round(self.middle, 1) if is_aside else 0.0
+        # The beams shall lie in the middle of bins, not between two of them.
+        facing = round(_wrap(self.first + width / 2), 3) if is_aside else 0.0
         return (
             f"data.sensor.field_of_view_deg={width:g} data.sensor.resolution_deg={resolution:g} "
             f"data.sensor.facing_deg={facing:g}"

@@ -317,7 +317,8 @@ class BeamReader:
         if self.ring is None or rings is None:
             fault = "its points do not come laser by laser, and none"
             return Scan.from_points(self._find_points(points, path, fault), self.stamps[frame])
-        if self.ring >= len(rings) or len(points) < FEWEST_POINTS:
+        # In a nearly blank frame of many lasers nobody can count to one of them.
+        if self.ring >= len(rings) or (self.ring and len(points) < FEWEST_POINTS):
             has = f"frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count from 0)"
             return Scan.from_points(
                 self._find_points(points, path, f"{has}, and no point"), self.stamps[frame]
