@@ -13,7 +13,7 @@ import numpy.typing as npt
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, planar_to_poses
 from rcnn_odom.recordings.broken_lines import BrokenLines
-from rcnn_odom.recordings.carmen_log.beams import FrontLaser
+from rcnn_odom.recordings.carmen_log.front_laser import FrontLaser
 from rcnn_odom.recordings.carmen_log.lines import PARSERS, LaserLine
 from rcnn_odom.recordings.carmen_log.params import check_field_of_view, find_front_laser
 from rcnn_odom.recordings.carmen_log.truth import find_reference, name_truth, read_truth, wheel_odometry
@@ -66,7 +66,7 @@ def load(
     front = find_front_laser(path, field_of_view_deg)
     other_lasers: Counter[str] = Counter()
     lines = list(_laser_lines(path, front.laser, other_lasers, strict=True))
-    beams = Beams.of(lines)
+    beams = LogReader.of(lines)
     if reference is None:
         poses, about_truth = planar_to_poses([line.laser for line in lines]), name_truth(lines)
     else:
@@ -113,7 +113,7 @@ def stream(path: Path, field_of_view_deg: float | None = None) -> ScanStream:
         log.warning("%s: %s", path, warning)
     skipped: Counter[str] = Counter()
     lines = _laser_lines(path, front.laser, skipped, strict=False)
-    scans = (Beams.of([line])(0) for line in lines)
+    scans = (LogReader.of([line])(0) for line in lines)
     return ScanStream(name=path.name, scans=scans, has_clock=False, skipped=skipped, notes=tuple(front.notes))
 
 
@@ -188,7 +188,7 @@ def _why_no_scan(path: Path, kinds: str, broken: BrokenLines, others: Counter[st
 
 
 @dataclass(frozen=True, eq=False)
-class Beams:
+class LogReader:
     """Frame index -> all beams of its scan, from memory.
 
     Readings at or beyond the maximum range that the log says come as infinite: no return.
@@ -205,7 +205,7 @@ class Beams:
     stamps: FloatArray
 
     @classmethod
-    def of(cls, lines: list[LaserLine]) -> "Beams":
+    def of(cls, lines: list[LaserLine]) -> "LogReader":
         """The beams of all lines."""
         return cls(
             np.concatenate([line.readings for line in lines]),
@@ -254,7 +254,7 @@ def _count_doubted(lines: list[LaserLine]) -> list[str]:
     return [f"{doubted} lines' maximum is not believed: most readings lie beyond it"] if doubted else []
 
 
-def _count_no_returns(beams: Beams, max_range: float | None) -> str:
+def _count_no_returns(beams: LogReader, max_range: float | None) -> str:
     maximum = np.repeat(beams.maximum, np.diff(beams.offsets))
     if max_range is not None:
         maximum = np.minimum(maximum, max_range)

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.recordings.carmen_log.beams import (
+from rcnn_odom.recordings.carmen_log.front_laser import (
     CIRCLE,
     PRINTED,
     FrontLaser,
