@@ -6,7 +6,7 @@ import lzma
 from pathlib import Path
 
 import numpy as np
-import zstandard
+from backports import zstd
 
 from data.make_kitti import cast, drive, world
 
@@ -14,7 +14,7 @@ MAX_READING = 81.91
 LASER_AHEAD = 0.2
 """Metres from the robot to its laser, straight ahead, on ROBOTLASER1 lines."""
 
-PACKINGS = {"gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": zstandard.compress}
+PACKINGS = {"gz": gzip.compress, "bz2": bz2.compress, "xz": lzma.compress, "zst": zstd.compress}
 
 
 def make_carmen(

@@ -82,6 +82,7 @@ def _tar() -> bytes:
             "Git LFS.*; fetch it with git lfs",
         ),
     ],
+    ids=["zip", "tar", "pointer"],
 )
 def test_what_is_no_recording_is_told(tmp_path, content, says):
     (tmp_path / "drive.bag").write_bytes(content)
