@@ -67,10 +67,7 @@ def load(
     other_lasers: Counter[str] = Counter()
     lines = list(_laser_lines(path, front.laser, other_lasers, strict=True))
     beams = LogReader.of(lines)
-    if reference is None:
-        poses, about_truth = planar_to_poses([line.laser for line in lines]), name_truth(lines)
-    else:
-        poses, about_truth = read_truth(find_reference(Path(reference), name), len(lines))
+    poses, about_truth = _find_truth(lines, name, reference)
     notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
     notes += [*_count_doubted(lines), *front.notes, *front.warnings]
     notes += [*_check_stamps(beams.stamps), *about_truth]
@@ -85,6 +82,15 @@ def load(
         wheel_odometry=wheel_odometry(lines),
         notes=tuple(notes),
     )
+
+
+def _find_truth(
+    lines: list[LaserLine], name: str, reference: str | Path | None
+) -> tuple[FloatArray, list[str]]:
+    """Poses (N, 4, 4) of the laser by the log itself or by its reference, and words about them."""
+    if reference is None:
+        return planar_to_poses([line.laser for line in lines]), name_truth(lines)
+    return read_truth(find_reference(Path(reference), name), len(lines))
 
 
 def recognises(path: Path) -> bool:

@@ -4,7 +4,7 @@ A cloud that was raised, to the ground or a robot's base, can still be read: onl
 elsewhere. In a tilted cloud, or in a camera's frame, the points of a ring lie on no such cone.
 """
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 
 import numpy as np
 
@@ -19,9 +19,13 @@ CLEARER = 2.0
 ONE_SIGMA = 68.0
 
 
-def steep_part(points: Points) -> float:
-    """The part of points (P, 3 or more) that is steeper than 45 degrees."""
-    return float(np.mean(np.abs(elevations_from(points, 0.0)) > STEEP)) if len(points) else 0.0
+def describe_steepness(clouds: Sequence[Points]) -> str:
+    """Why clouds, each (P, 3 or more), are not in their laser's frame; empty where they may be."""
+    points = np.concatenate(clouds)
+    steep = float(np.mean(np.abs(elevations_from(points, 0.0)) > STEEP)) if len(points) else 0.0
+    if steep <= MOST_STEEP:
+        return ""
+    return f"{100 * steep:.0f} % of the points are steeper than 45 degrees, as in a camera's frame"
 
 
 def find_rise(rings: Iterable[Points]) -> float:

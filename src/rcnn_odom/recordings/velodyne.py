@@ -20,6 +20,8 @@ sequences; the upper one is also the one that a pitching car turns into the road
 NEAR_LEVEL = np.deg2rad(2.0)
 """A beam farther from ``LEVEL`` sees the road or the sky instead of walls."""
 HALF_RING_SPACING = np.deg2rad(0.2)
+FARTHEST = np.float32(1e6)
+"""Metres: what claims to be farther away is no return."""
 RING_DROP = np.deg2rad(30.0)
 """The azimuth drops by more than this between rings; within one, close objects make it drop by up to 7."""
 

@@ -10,11 +10,12 @@ import numpy as np
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.beams import Beams
-from rcnn_odom.recordings.laser_frame import MOST_STEEP, cone_spread, find_rise, lowered, steep_part
+from rcnn_odom.recordings.laser_frame import cone_spread, describe_steepness, find_rise, lowered
 from rcnn_odom.recordings.packing import refuse_pointer
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.trajectory import read_lines
 from rcnn_odom.recordings.velodyne import (
+    FARTHEST,
     HALF_RING_SPACING,
     LEVEL,
     NEAR_LEVEL,
@@ -32,8 +33,6 @@ POINT_BYTES = 16
 LARGEST_POINTER = 1024
 """Bytes of a pointer of Git LFS, at most."""
 VELODYNE = Beams(first=-180.0, covered=360.0, spacing=0.18)
-FARTHEST = np.float32(1e6)
-"""Metres: what claims to be farther away is no return."""
 SAMPLED_FRAMES = 20
 FRAMES_OF_BEAM = 5
 """So many frames tell where a beam lies whose points come in any order."""
@@ -169,11 +168,12 @@ def choose_beam(
         raise InputError(f"{files[0]}: neither it nor the other frames have a point; download them again")
     if files[0].endswith(".bin"):
         _check_reflectance(clouds, files[0])
-    if ring is None:
-        _check_steepness(clouds, files[0])
-    ringed = [rings for cloud in clouds if (rings := split_rings(cloud)) is not None]
+    if ring is None and (fault := describe_steepness(clouds)):
+        raise InputError(f"{files[0]}: {fault}; give them in the laser's, x ahead and z up")
+    split = [split_rings(cloud) for cloud in clouds]
+    ringed = [rings for rings in split if rings is not None]
     if 2 * len(ringed) < len(clouds):
-        disordered = [cloud for cloud in clouds if split_rings(cloud) is None]
+        disordered = [cloud for cloud, rings in zip(clouds, split, strict=True) if rings is None]
         return _by_elevation(files, stamps, ring, disordered)
     return _by_ring(files, stamps, ring, ringed, len(clouds))
 
@@ -208,15 +208,6 @@ def _without_blank(clouds: list[Points]) -> list[Points]:
     """The clouds that have about as many points as the others, at least one."""
     most = max(map(len, clouds))
     return [cloud for cloud in clouds if len(cloud) > 0 and 100 * len(cloud) >= most]
-
-
-def _check_steepness(clouds: list[Points], path: str) -> None:
-    steep = steep_part(np.concatenate(clouds))
-    if steep > MOST_STEEP:
-        raise InputError(
-            f"{path}: {100 * steep:.0f} % of the points are steeper than 45 degrees, as in a camera's frame; "
-            "give them in the laser's, x ahead and z up"
-        )
 
 
 def _check_reflectance(clouds: list[Points], path: str) -> None:

@@ -7,13 +7,12 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.recordings.beams import Beams, find_beams
+from rcnn_odom.recordings.velodyne import FARTHEST
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
 """Of fields, by the numbers of sensor_msgs/msg/PointField."""
 RING_FIELDS = ("ring", "channel")
 """Names under which drivers write which of their lasers saw a point."""
-FARTHEST = 1e6
-"""Metres: what claims to be farther away is no return."""
 PLANE = 1e-3
 """Metres between the lowest and the highest point of a laser that has a single plane."""
 SAME_BEAM_DEG = 0.01
@@ -148,14 +147,10 @@ def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
 
 
 def _check_steepness(clouds: Sequence[Cloud]) -> None:
-    from rcnn_odom.recordings.laser_frame import MOST_STEEP, steep_part
+    from rcnn_odom.recordings.laser_frame import describe_steepness
 
-    steep = steep_part(np.concatenate([cloud.points for cloud in clouds]))
-    if steep > MOST_STEEP:
-        raise ValueError(
-            f"{100 * steep:.0f} % of the points are steeper than 45 degrees, as in a camera's frame; "
-            f"{IN_ITS_FRAME}"
-        )
+    if fault := describe_steepness([cloud.points for cloud in clouds]):
+        raise ValueError(f"{fault}; {IN_ITS_FRAME}")
 
 
 def _between(points: Points, low: float, high: float) -> Points:
