@@ -12,9 +12,10 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import Step, Steps
+from rcnn_odom.geometry import FloatArray, Step, Steps
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.registry import choose, collect, modules_in
 
 
@@ -46,6 +47,55 @@ class Stepper(Protocol):
 
     def reset(self) -> None:
         """Forgets all earlier pairs."""
+
+
+@dataclass(frozen=True, eq=False)
+class Registered:
+    """What a model in a stream makes of one more scan.
+
+    Attributes:
+        step: from the scan before. Where nothing could be estimated, the last motion, with a covariance that
+            says how wrong that may be.
+        notes: what the step suffers from, each with its kind before a colon; empty: nothing.
+        is_estimated: the step comes from this scan, at least in part; otherwise the last motion went on.
+    """
+
+    step: Step
+    notes: tuple[str, ...] = ()
+    is_estimated: bool = True
+
+
+class ScanTracker(Protocol):
+    """A model in a stream of whole scans: it keeps what it needs of those before."""
+
+    period: float
+    """Usual seconds between scans in training; nan: any."""
+
+    def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
+        """The step to one more scan.
+
+        Args:
+            scan: as the laser gave it.
+            periods: usual times between scans since the last one, more than 1 over a gap.
+            seconds: since the last one; None: unknown.
+        """
+
+    def begin(self, scan: Scan) -> tuple[str, ...]:
+        """Takes a scan that cannot be compared with those before: the first, or after a clock was set.
+
+        Returns:
+            Notes as in :class:`Registered`.
+        """
+
+    def reset(self) -> None:
+        """Forgets everything: the next scan is the first of another laser or of another place of it."""
+
+    @property
+    def has_seen(self) -> bool:
+        """Whether there is a scan with returns that the next one can be compared with."""
+
+    def returns(self) -> FloatArray:
+        """Points (P, 2) in metres of the last scan in the laser's frame; empty where it was not used."""
 
 
 class Model(ABC):

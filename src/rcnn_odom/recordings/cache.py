@@ -132,6 +132,9 @@ def encode_recordings(
             stamps=recording.stamps,
             camera_from_laser=recording.camera_from_laser,
             wheel_odometry=recording.wheel_odometry,
+            has_clock=recording.has_clock,
+            is_compensated=recording.is_compensated,
+            read_scan=recording.read_scan,
         )
         for recording, found in zip(recordings, scans, strict=True)
         if found is not None

@@ -1,6 +1,6 @@
 """What every recording looks like once it has been opened, and a drive as estimators are given it."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 
@@ -29,6 +29,8 @@ class Recording:
         camera_from_laser: (4, 4), KITTI's ``Tr``: the frame in which trajectories are written.
         wheel_odometry: (N, 4, 4) laser poses by the robot's own odometry, where the log has them.
         notes: what the reader noticed, counted or flagged, in words for the user.
+        has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
+        is_compensated: the motion of the laser during a revolution has been taken out of its points already.
     """
 
     name: str
@@ -39,6 +41,8 @@ class Recording:
     camera_from_laser: FloatArray = field(default_factory=FORWARD_CAMERA.copy)
     wheel_odometry: FloatArray | None = None
     notes: tuple[str, ...] = ()
+    has_clock: bool = True
+    is_compensated: bool = False
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -55,10 +59,13 @@ class Drive:
     Attributes:
         name: of the recording; of a part ``NAME[a:b]``.
         key: changes whenever ``scans`` does.
-        scans: (N, bins) float32, the encoded scans: depth vectors in metres.
+        scans: (N, bins) float32, the encoded scans: depth vectors in metres; no bins for models that do not
+            look at them.
         poses: (N, 4, 4) true laser poses.
         stamps: (N,) seconds.
-        camera_from_laser, wheel_odometry: as in :class:`Recording`.
+        camera_from_laser, wheel_odometry, has_clock, is_compensated: as in :class:`Recording`.
+        read_scan: of the recording.
+        frames: the recording's frame of each scan; None: all of them.
     """
 
     name: str
@@ -68,9 +75,20 @@ class Drive:
     stamps: FloatArray
     camera_from_laser: FloatArray
     wheel_odometry: FloatArray | None = None
+    has_clock: bool = True
+    is_compensated: bool = False
+    read_scan: ReadScan | None = None
+    frames: range | None = None
 
     def __len__(self) -> int:
         return len(self.scans)
+
+    def raw_scans(self) -> Iterator[Scan]:
+        """The scans as the laser gave them, one after the other; without stamps where there is no clock."""
+        assert self.read_scan is not None, f"{self.name} was made of encoded scans alone"
+        for frame in self.frames or range(len(self)):
+            scan = self.read_scan(frame)
+            yield scan if self.has_clock else replace(scan, stamp=None)
 
     @cached_property
     def steps(self) -> FloatArray:
@@ -97,4 +115,5 @@ class Drive:
             poses=self.poses[start:stop],
             stamps=self.stamps[start:stop],
             wheel_odometry=None if wheel is None else wheel[start:stop],
+            frames=(self.frames or range(len(self)))[start:stop],
         )

@@ -21,6 +21,8 @@ class Scan:
         frame_id: name of the laser's frame, empty if unknown.
         has_all_beams: the beams without a return are there too, so that spacing and extent of the beams can
             be told; False where only returns are given, as the points of a cloud.
+        wheel_pose: x and y in metres and heading in radians of the laser by the robot's own odometry when
+            the scan was taken, in whatever frame that has; None: unknown.
     """
 
     ranges: FloatArray
@@ -29,6 +31,7 @@ class Scan:
     stamp: float | None = None
     frame_id: str = ""
     has_all_beams: bool = True
+    wheel_pose: tuple[float, float, float] | None = None
 
     def __post_init__(self) -> None:
         for values in (self.bearings, self.times):
