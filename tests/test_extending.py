@@ -138,7 +138,14 @@ def test_exported_it_runs_on_a_recording_of_the_format(place, call, run):
     call("-m", "rcnn_odom.cli", "export", run)
     out = place / "poses"
     printed = call(
-        "-m", "rcnn_odom.cli", "run", run / "model.onnx", place / "drives" / "test.scans", "--out", out
+        "-m",
+        "rcnn_odom.cli",
+        "run",
+        place / "drives" / "test.scans",
+        "--model",
+        run / "model.onnx",
+        "--out",
+        out,
     )
     assert "80 scans" in printed
     steps = [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
@@ -184,11 +191,11 @@ def test_two_models_of_one_name_are_refused(place, call, run):
     path = place / "my_lasers" / "my_lasers-1.0.dist-info" / "entry_points.txt"
     text = path.read_text()
     try:
-        path.write_text(text.replace("small_net = ", "icp = "))
+        path.write_text(text.replace("small_net = ", "matcher = "))
         printed = call(ROOT / "train.py", "model=cnn_reg", "data.frames=20", status=1)
     finally:
         path.write_text(text)
-    assert "two models are called icp" in printed
+    assert "two models are called matcher" in printed
 
 
 @pytest.mark.slow

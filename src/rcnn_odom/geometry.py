@@ -5,7 +5,7 @@ the laser is at one scan, seen from where it was at the scan before: x and y in 
 radians, counter-clockwise. Every estimator gives steps, and everything that scores or draws knows them only.
 """
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -31,6 +31,9 @@ class Step:
         x, y: metres ahead and to the left in the frame of the earlier scan.
         heading: radians, counter-clockwise.
         covariance: (3, 3) of x, y and heading in the frame of the earlier scan; nan where unknown.
+        taken_back: (3, 3) covariance of the part of its error that the next step takes back, in the frame of
+            the later scan: the error of a pose in a map, for instance, which is in the step to it and, with the
+            opposite sign, in the step from it. 0: the errors of steps are independent.
 
     >>> Step(1.0, 0.0, 0.1).array()
     array([1. , 0. , 0.1])
@@ -40,6 +43,7 @@ class Step:
     y: float
     heading: float
     covariance: FloatArray = field(default_factory=unknown_covariance)
+    taken_back: FloatArray = field(default_factory=lambda: np.zeros((3, 3)))
 
     def array(self) -> FloatArray:
         """x, y and heading, (3,)."""
@@ -132,6 +136,134 @@ def advance(pose: FloatArray, step: FloatArray) -> FloatArray:
     x, y, heading = pose
     cos, sin = np.cos(heading), np.sin(heading)
     return np.array([x + cos * step[0] - sin * step[1], y + sin * step[0] + cos * step[1], heading + step[2]])
+
+
+def relative_step(pose: FloatArray, later: FloatArray) -> FloatArray:
+    """The step (3,) from one pose, x, y and heading (3,), to a later one: what :func:`advance` undoes.
+
+    >>> relative_step(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0, np.pi / 2])).round(6)
+    array([2., 0., 0.])
+    """
+    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    x, y = later[0] - pose[0], later[1] - pose[1]
+    turn = (later[2] - pose[2] + np.pi) % (2 * np.pi) - np.pi
+    return np.array([cos * x + sin * y, -sin * x + cos * y, turn])
+
+
+def compound_covariance(pose: FloatArray, covariance: FloatArray, step: Step) -> FloatArray:
+    """The covariance (3, 3) of the pose after a step that is independent of the poses before.
+
+    To first order (Smith, Self and Cheeseman, 1990), in the frame that the pose is told of.
+
+    Args:
+        pose: x, y and heading (3,) before the step.
+        covariance: (3, 3), its own; nan where unknown.
+        step: the step, with its covariance.
+
+    >>> ahead = Step(2.0, 0.0, 0.0, np.zeros((3, 3)))
+    >>> compound_covariance(np.zeros(3), np.diag([0.0, 0.0, 0.01]), ahead).round(6).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.04, 0.02], [0.0, 0.02, 0.01]]
+    """
+    of_pose, of_step = np.eye(3), _turn(pose[2])
+    x, y, _ = of_step @ step.array()
+    of_pose[:2, 2] = -y, x
+    return _carry(of_pose, covariance) + _carry(of_step, step.covariance)
+
+
+class AccumulatedCovariance:
+    """The covariance of a pose, accumulated along the steps to it, in the frame of the first pose.
+
+    What a step takes back of the error of the one before (``Step.taken_back``) does not add up: only the rest
+    does, and beside it stands what the next step will take back.
+
+    Attributes:
+        value: (3, 3) of x, y and heading; what depends on a step of unknown covariance stays nan.
+    """
+
+    def __init__(self) -> None:
+        self.value: FloatArray = np.zeros((3, 3))
+        self._drift: FloatArray = np.zeros((3, 3))
+        self._open: FloatArray = np.zeros((3, 3))  # what the next step takes back, in the last pose's frame
+
+    def add(self, pose: FloatArray, step: Step) -> None:
+        """One more step, from this pose, x, y and heading (3,)."""
+        lasting = step.covariance
+        if self._open.any() or step.taken_back.any():
+            lever = np.array([[1.0, 0.0, -step.y], [0.0, 1.0, step.x], [0.0, 0.0, 1.0]])
+            lasting = lasting - _carry(lever, self._open) - _carry(_turn(step.heading), step.taken_back)
+            lasting = _without_negative(lasting)
+        self._open = step.taken_back
+        self._drift = compound_covariance(pose, self._drift, replace(step, covariance=lasting))
+        self.value = self._drift + _carry(_turn(pose[2] + step.heading), self._open)
+
+
+def _turn(heading: float) -> FloatArray:
+    """What turns x and y of a covariance (3, 3) by a heading."""
+    cos, sin = np.cos(heading), np.sin(heading)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _without_negative(covariance: FloatArray) -> FloatArray:
+    """The nearest matrix (3, 3) that is a covariance; one with nan as it is."""
+    if np.isnan(covariance).any():
+        return covariance
+    variances, directions = np.linalg.eigh(covariance)
+    return (directions * np.maximum(variances, 0.0)) @ directions.T
+
+
+def change_step_frame(step: Step, laser_pose: tuple[float, float, float]) -> Step:
+    """The step of a robot whose laser has made one: T S T^-1 with the pose T of the laser on the robot.
+
+    The covariance is carried over to first order.
+
+    Args:
+        step: of the laser.
+        laser_pose: x and y in metres and heading in radians of the laser on the robot.
+
+    >>> turn = change_step_frame(Step(-0.5, 0.5, np.pi / 2), (0.5, 0.0, 0.0))  # the laser is ahead
+    >>> (turn.array().round(6) + 0.0).tolist()  # the robot turns on the spot
+    [0.0, 0.0, 1.570796]
+    """
+    x, y, angle = laser_pose
+    cos, sin = np.cos(angle), np.sin(angle)
+    cos_turn, sin_turn = np.cos(step.heading), np.sin(step.heading)
+    jacobian = np.array(
+        [
+            [cos, -sin, sin_turn * x + cos_turn * y],
+            [sin, cos, -cos_turn * x + sin_turn * y],
+            [0.0, 0.0, 1.0],
+        ]
+    )
+    return Step(
+        float(x + cos * step.x - sin * step.y - (cos_turn * x - sin_turn * y)),
+        float(y + sin * step.x + cos * step.y - (sin_turn * x + cos_turn * y)),
+        step.heading,
+        _carry(jacobian, step.covariance),
+        _carry(np.array([[cos, -sin, y], [sin, cos, -x], [0.0, 0.0, 1.0]]), step.taken_back),
+    )
+
+
+def turn_to_middle(step: Step) -> Step:
+    """A step told of the heading in mid-turn: what the body itself moves, divided by the time its velocity.
+
+    >>> turn_to_middle(Step(0.0, 1.0, np.pi)).array().round(6).tolist()  # a half circle to the left
+    [1.0, 0.0, 3.141593]
+    """
+    cos, sin = np.cos(step.heading / 2), np.sin(step.heading / 2)
+    x, y = float(cos * step.x + sin * step.y), float(-sin * step.x + cos * step.y)
+    jacobian = np.array([[cos, sin, y / 2], [-sin, cos, -x / 2], [0.0, 0.0, 1.0]])
+    return Step(x, y, step.heading, _carry(jacobian, step.covariance))
+
+
+def _carry(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
+    """J C J^T, where what is unknown (nan) spreads only to what depends on it."""
+    unknown = np.isnan(covariance)
+    if not unknown.any():
+        return jacobian @ covariance @ jacobian.T
+    carried = jacobian @ np.where(unknown, 0.0, covariance) @ jacobian.T
+    weights = (jacobian != 0).astype(np.float64)
+    carried[weights @ unknown @ weights.T > 0] = np.nan
+    return carried
 
 
 def compose(steps: npt.ArrayLike) -> FloatArray:

@@ -427,7 +427,7 @@ def test_what_is_no_checkpoint_gives_one_short_line(tmp_path, capsys, content):
     (tmp_path / "log").touch()
     for arguments in (
         ["export", str(path), "--no-drift"],
-        ["run", str(path), str(tmp_path / "log"), "--out", str(tmp_path / "out")],
+        ["run", str(tmp_path / "log"), "--model", str(path), "--out", str(tmp_path / "out")],
     ):
         assert main(arguments) == 1
         error = one_line_error(capsys)

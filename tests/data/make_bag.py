@@ -10,11 +10,13 @@ from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Writer1
 from rosbags.rosbag2 import CompressionFormat, CompressionMode, StoragePlugin
 from rosbags.rosbag2 import Writer as Writer2
-from rosbags.typesys import Stores, get_typestore
+from rosbags.typesys import Stores, get_types_from_msg, get_typestore
+from scipy.spatial.transform import Rotation
 
 FORMATS = ("ros1", "sqlite3", "mcap")
 START = 1_700_000_000
 SCAN, CLOUD, TEXT = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2", "std_msgs/msg/String"
+ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 CODES = {"i1": 1, "u1": 2, "i2": 3, "u2": 4, "i4": 5, "u4": 6, "f4": 7, "f8": 8}
 """Of types of fields of a point cloud, as in sensor_msgs/msg/PointField."""
 LZ4 = CompressionType.LZ4
@@ -73,18 +75,21 @@ def write_bag(folder: Path, kind: str, topics: dict, messages: list, compression
 
 @cache
 def store_of(kind: str):
-    return get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    store = get_typestore(Stores.ROS1_NOETIC if kind == "ros1" else Stores.ROS2_HUMBLE)
+    if TRANSFORMS not in store.types:
+        store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
+    return store
 
 
 def arrival_of(number: int) -> int:
     return START * 10**9 + 10**8 * number + 1000
 
 
-def header(store, stamp, first, number=0):
+def header(store, stamp, first, number=0, frame_id="laser"):
     seconds = int(stamp)
     time = store.types["builtin_interfaces/msg/Time"](sec=seconds, nanosec=round((stamp - seconds) * 1e9))
     sequence = {"seq": number} if first else {}
-    return store.types["std_msgs/msg/Header"](stamp=time, frame_id="laser", **sequence)
+    return store.types["std_msgs/msg/Header"](stamp=time, frame_id=frame_id, **sequence)
 
 
 def laser_scan(store, ranges, stamp, field_of_view_deg, first, number=0, **changes):
@@ -103,6 +108,40 @@ def laser_scan(store, ranges, stamp, field_of_view_deg, first, number=0, **chang
         "intensities": np.zeros(0, np.float32),
     }
     return store.types[SCAN](**fields | changes)
+
+
+def odometry(store, pose, stamp, first, robot="base_link"):
+    """One message of x and y in metres and heading in radians of a robot."""
+    x, y, heading = pose
+    make = _maker(store)
+    turn = Rotation.from_euler("z", heading).as_quat().tolist()
+    zero = make("Vector3", 0.0, 0.0, 0.0)
+    at = make("Pose", make("Point", float(x), float(y), 0.0), make("Quaternion", *turn))
+    return store.types[ODOMETRY](
+        header=header(store, stamp, first, frame_id="odom"),
+        child_frame_id=robot,
+        pose=make("PoseWithCovariance", at, np.zeros(36)),
+        twist=make("TwistWithCovariance", make("Twist", zero, zero), np.zeros(36)),
+    )
+
+
+def static_transforms(store, transforms, first):
+    """One message of poses (x, y, z in metres, roll, pitch, yaw in degrees) by (frame, its child)."""
+    make = _maker(store)
+    stamped = [
+        store.types["geometry_msgs/msg/TransformStamped"](
+            header=header(store, START, first, frame_id=frame),
+            child_frame_id=child,
+            transform=make("Transform", make("Vector3", *map(float, pose[:3])), make("Quaternion", *turn)),
+        )
+        for (frame, child), pose in transforms.items()
+        for turn in [Rotation.from_euler("xyz", pose[3:], degrees=True).as_quat().tolist()]
+    ]
+    return store.types[TRANSFORMS](transforms=stamped)
+
+
+def _maker(store):
+    return lambda name, *values: store.types[f"geometry_msgs/msg/{name}"](*values)
 
 
 def point_cloud(store, arrays, stamp, first, columns=None, big_endian=False, gap=0, row_gap=0, **changes):

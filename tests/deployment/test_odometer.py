@@ -2,6 +2,8 @@
 
 import json
 import math
+import subprocess
+import sys
 import tracemalloc
 from dataclasses import replace
 
@@ -9,14 +11,16 @@ import numpy as np
 import pytest
 import torch
 
+from conftest import ROOT
 from odometry import ANGLES, NAMES, build, random_scans
-from rcnn_odom.deployment.clock import CLOCK_JUMP, LATE_IN_A_ROW
-from rcnn_odom.deployment.odometer import LONGEST_HOLD, Odometer
+from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import Step, advance, compose, poses_to_planar
-from rcnn_odom.models.contract import Description
+from rcnn_odom.geometry import Step, advance, compose, compound_covariance, planar_to_poses, poses_to_planar
+from rcnn_odom.models.contract import Description, Registered
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import LONGEST_HOLD, PairTracker
 from rcnn_odom.recordings.beams import PATIENCE
+from rcnn_odom.recordings.clock import CLOCK_JUMP, LATE_IN_A_ROW
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training.onnx_graph import to_onnx, write
 
@@ -88,7 +92,7 @@ def test_steps_equal_the_offline_estimate(variant, projection, tmp_path):
     offline = model.estimate_scans(torch.from_numpy(scans))
     expected = poses_to_planar(offline.poses())
     write(to_onnx(model, "fp32"), tmp_path / "model.onnx")
-    for odometer in (Odometer(model.stepper()), Odometer.from_onnx(tmp_path / "model.onnx")):
+    for odometer in (Odometer(model.tracker()), Odometer.from_onnx(tmp_path / "model.onnx")):
         poses = drive(odometer, scans)
         streamed = np.array([[pose.x, pose.y, pose.heading] for pose in poses])
         np.testing.assert_allclose(streamed[:, :2], expected[:, :2], atol=1e-5)
@@ -106,7 +110,7 @@ def test_steps_equal_the_offline_estimate(variant, projection, tmp_path):
 
 
 def test_the_first_scan_is_the_origin_and_reset_begins_anew():
-    odometer = Odometer(Remembering())
+    odometer = Odometer(PairTracker(Remembering()))
     scans = random_scans(6)
     first = drive(odometer, scans)
     assert (first[0].x, first[0].y, first[0].heading) == (0, 0, 0)
@@ -118,8 +122,8 @@ def test_the_first_scan_is_the_origin_and_reset_begins_anew():
 
 def test_ranges_with_and_without_angles_and_points_are_the_same():
     scans = random_scans(5).astype(np.float64)
-    expected = drive(Odometer(Remembering()), scans)
-    even, points = (Odometer(Remembering()) for _ in range(2))
+    expected = drive(Odometer(PairTracker(Remembering())), scans)
+    even, points = (Odometer(PairTracker(Remembering())) for _ in range(2))
     for number, scan in enumerate(scans):
         stamp = PERIOD * number
         assert_same([even.step(scan, stamp)], [expected[number]])
@@ -130,7 +134,7 @@ def test_ranges_with_and_without_angles_and_points_are_the_same():
 
 def test_a_scan_without_returns_lets_the_last_motion_go_on(recorder):
     scans = random_scans(7)
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     poses = drive(odometer, [*scans[:5], np.zeros(181), scans[5], scans[6]])
     assert len(recorder.pairs) == 4 + 1, "neither the empty scan nor the pair across it reaches the network"
     np.testing.assert_array_equal(recorder.pairs[-1], scans[5:])
@@ -150,14 +154,14 @@ def test_a_scan_without_returns_lets_the_last_motion_go_on(recorder):
     "nothing", [np.full(181, np.inf), np.full(181, np.nan), np.full(181, 40.0), np.zeros(0)]
 )
 def test_no_returns_in_other_words(recorder, nothing):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(5))
     pose = odometer.step(nothing, 0.5)
     assert "no returns" in pose.degraded
 
 
 def test_nothing_at_first_is_still_the_origin(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     pose = odometer.step(np.zeros(181), 0.0)
     assert (pose.x, pose.y) == (0, 0)
     assert "no returns" in pose.degraded
@@ -167,7 +171,7 @@ def test_nothing_at_first_is_still_the_origin(recorder):
 
 def test_dropped_scans_are_bridged_and_the_state_survives(recorder):
     scans = random_scans(20)
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     before = drive(odometer, scans[:6])
     after = odometer.step(scans[8], PERIOD * 8, ANGLES)
     assert "gap: 3 periods" in after.degraded
@@ -185,7 +189,7 @@ def test_dropped_scans_are_bridged_and_the_state_survives(recorder):
 
 
 def test_over_a_long_gap_the_motion_ends(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     last = drive(odometer, random_scans(6))[-1]
     pose = odometer.step(random_scans(1)[0], 0.5 + CLOCK_JUMP - 0.1, ANGLES)
     assert math.hypot(pose.x - last.x, pose.y - last.y) <= LONGEST_HOLD * 0.5
@@ -203,7 +207,7 @@ def test_over_a_long_gap_the_motion_ends(recorder):
 
 def test_a_late_scan_is_passed_over():
     scans = random_scans(8)
-    straight, disturbed = (Odometer(Remembering()) for _ in range(2))
+    straight, disturbed = (Odometer(PairTracker(Remembering())) for _ in range(2))
     expected = drive(straight, scans)
     drive(disturbed, scans[:5])
     for stamp in (0.4, 0.1, -5.0):
@@ -221,7 +225,7 @@ def test_a_late_scan_is_passed_over():
 
 
 def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(5))
     empty = odometer.step(np.zeros(181), 0.5)
     late = odometer.step(np.full(361, 5.0), 0.45)
@@ -232,7 +236,7 @@ def test_a_late_scan_after_an_empty_one_does_not_take_it_back(recorder):
 @pytest.mark.parametrize("jump", [-1.7e9, -1000.0, -10.5, 10.5, 1000.0, 1.7e9])
 def test_over_a_jump_of_the_clock_no_motion_is_added(recorder, jump):
     """Without a jump there would be 39 steps; over the one nobody knows, the rest is as if nothing were."""
-    odometer, scans = Odometer(recorder), random_scans(40)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(40)
     before = drive(odometer, scans[:20])
     after = [odometer.step(scan, 2.0 + jump + 0.1 * n, ANGLES) for n, scan in enumerate(scans[20:])]
     assert after[0].degraded.startswith("clock set: from 1.9 to ")
@@ -247,7 +251,7 @@ def test_over_a_jump_of_the_clock_no_motion_is_added(recorder, jump):
 
 
 def test_a_clock_that_goes_back_a_little_costs_a_few_scans(recorder):
-    odometer, scans = Odometer(recorder), random_scans(60)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(60)
     drive(odometer, scans[:20])
     later = [odometer.step(scan, 2.1 - 5.0 + 0.1 * n, ANGLES) for n, scan in enumerate(scans[21:])]
     kinds = [pose.degraded.split(":")[0] for pose in later]
@@ -258,7 +262,7 @@ def test_a_clock_that_goes_back_a_little_costs_a_few_scans(recorder):
 
 
 def test_one_wild_stamp_costs_two_steps(recorder):
-    odometer, scans = Odometer(recorder), random_scans(10)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(10)
     stamps = [0.0, 0.1, 0.2, 1e6, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9]
     poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
     assert [pose.degraded.split(":")[0] for pose in poses] == [""] * 3 + ["clock set"] * 2 + [""] * 5
@@ -268,7 +272,7 @@ def test_one_wild_stamp_costs_two_steps(recorder):
 @pytest.mark.parametrize("stamp", [0.0, 5.0])
 def test_a_clock_that_stands_still_is_none(recorder, stamp):
     """A 0 at once; of another stamp the first four might have come late."""
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     poses = [odometer.step(scan, stamp, ANGLES) for scan in random_scans(30)]
     kinds = [pose.degraded.split(":")[0] for pose in poses]
     lost = 0 if stamp == 0 else LATE_IN_A_ROW - 1
@@ -277,7 +281,7 @@ def test_a_clock_that_stands_still_is_none(recorder, stamp):
 
 
 def test_a_stamp_of_zero_among_others_is_none(recorder):
-    odometer, scans = Odometer(recorder), random_scans(30)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(30)
     stamps = [0.0 if n in (0, 7, 12, 13) else 1000 + 0.1 * n for n in range(30)]
     poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
     assert not any(pose.degraded for pose in poses)
@@ -287,7 +291,7 @@ def test_a_stamp_of_zero_among_others_is_none(recorder):
 @pytest.mark.parametrize("size", [2, 3, 10])
 def test_a_coarse_clock_is_followed(recorder, size):
     """Stamps that several scans share, as whole seconds: soon only the time between the groups counts."""
-    odometer, scans = Odometer(recorder), random_scans(100)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(100)
     stamps = [5.0 + PERIOD * (n // size) * size for n in range(100)]
     poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(scans, stamps, strict=True)]
     assert [pose.degraded for pose in poses[30:]] == [""] * 70
@@ -295,7 +299,7 @@ def test_a_coarse_clock_is_followed(recorder, size):
 
 
 def test_a_scan_that_is_sent_twice_counts_once(recorder):
-    odometer, scans = Odometer(recorder), np.repeat(random_scans(40), 2, axis=0)
+    odometer, scans = Odometer(PairTracker(recorder)), np.repeat(random_scans(40), 2, axis=0)
     poses = [odometer.step(scan, 1 + PERIOD * (n // 2), ANGLES) for n, scan in enumerate(scans)]
     assert [pose.degraded.split(":")[0] for pose in poses] == ["", "late scan"] * 40
     assert len(recorder.pairs) == 39
@@ -304,7 +308,7 @@ def test_a_scan_that_is_sent_twice_counts_once(recorder):
 @pytest.mark.parametrize("stamps", [100.0 * np.arange(1, 41), 1e6 * (-1.0) ** np.arange(40)])
 def test_a_wild_clock_is_none_after_a_while(recorder, stamps):
     """As stamps in milliseconds."""
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     poses = [odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(random_scans(40), stamps, strict=True)]
     kinds = [pose.degraded.split(":")[0] for pose in poses]
     assert kinds == ["", *["clock set"] * 5, *[""] * 34]
@@ -313,7 +317,7 @@ def test_a_wild_clock_is_none_after_a_while(recorder, stamps):
 
 
 def test_a_laser_that_does_not_fit_gives_way_to_one_that_does(recorder):
-    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(20).astype(np.float64)
     for n, scan in enumerate(scans):
         front = Scan(scan, ANGLES, stamp=PERIOD * n, frame_id="front")
         rear = Scan(scan[:91], ANGLES[:91], stamp=PERIOD * n - PERIOD / 2, frame_id="rear")
@@ -324,7 +328,7 @@ def test_a_laser_that_does_not_fit_gives_way_to_one_that_does(recorder):
 
 def test_a_scan_of_another_frame_is_passed_over(recorder):
     """Two lasers on one topic: the first one's scans are compared, the others' are not."""
-    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(20).astype(np.float64)
     frames = ["front", "rear", "/front", "rear", *["front", "rear"] * 8]
     poses = [
         odometer.step(Scan(scan, ANGLES, stamp=PERIOD / 2 * n, frame_id=frame))
@@ -338,7 +342,7 @@ def test_a_scan_of_another_frame_is_passed_over(recorder):
 
 
 def test_a_frame_that_changes_for_good_is_the_lasers(recorder):
-    odometer, scans = Odometer(recorder), random_scans(20).astype(np.float64)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(20).astype(np.float64)
     poses = [
         odometer.step(Scan(scan, ANGLES, stamp=0.1 * n, frame_id="front" if n < 8 else "laser_link"))
         for n, scan in enumerate(scans)
@@ -362,7 +366,7 @@ def test_a_frame_that_changes_for_good_is_the_lasers(recorder):
     ],
 )
 def test_a_scan_of_another_laser_is_not_used(recorder, other, says):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(5))
     poses = [odometer.step(replace(other, stamp=0.5 + 0.1 * n)) for n in range(PATIENCE + 3)]
     for pose in poses:
@@ -377,7 +381,7 @@ def test_a_scan_of_another_laser_is_not_used(recorder, other, says):
 
 def test_a_bursty_clock_is_no_gap(recorder):
     """Scans that arrive in pairs, 10 ms apart every 200 ms."""
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     stamps = [0.2 * (number // 2) + 0.01 * (number % 2) for number in range(200)]
     poses = [
         odometer.step(scan, stamp, ANGLES) for scan, stamp in zip(random_scans(200), stamps, strict=True)
@@ -387,20 +391,20 @@ def test_a_bursty_clock_is_no_gap(recorder):
 
 
 def test_gaps_are_seen_from_the_first_scans_on(recorder):
-    odometer, scans = Odometer(recorder), random_scans(3)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(3)
     odometer.step(scans[0], 0.0, ANGLES)
     assert odometer.step(scans[1], 0.1, ANGLES).degraded == ""
     assert "gap: 10 periods" in odometer.step(scans[2], 1.1, ANGLES).degraded
 
 
 def test_another_rate_than_trainings_is_told(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     poses = [odometer.step(scan, 0.3 * number, ANGLES) for number, scan in enumerate(random_scans(20))]
     assert all("gap" in pose.degraded for pose in poses[1:4])
     assert [pose.degraded for pose in poses[10:]] == [
         "slow scans: one every 0.3 s, in training every 0.1 s"
     ] * 10
-    fast = Odometer(recorder)
+    fast = Odometer(PairTracker(recorder))
     poses = [fast.step(scan, 0.05 * number, ANGLES) for number, scan in enumerate(random_scans(20))]
     assert [pose.degraded for pose in poses[10:]] == [
         "fast scans: one every 0.05 s, in training every 0.1 s"
@@ -409,7 +413,7 @@ def test_another_rate_than_trainings_is_told(recorder):
 
 @pytest.mark.parametrize("unstamped", [[7], range(3, 23), range(1, 40, 2)])
 def test_scans_without_stamps_among_others_count_once(recorder, unstamped):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     for number, scan in enumerate(random_scans(40)):
         pose = odometer.step(scan, None if number in unstamped else PERIOD * number, ANGLES)
         assert pose.degraded == ""
@@ -417,7 +421,7 @@ def test_scans_without_stamps_among_others_count_once(recorder, unstamped):
 
 
 def test_wild_stamps_and_angles_do_not_raise(recorder):
-    odometer, scans = Odometer(recorder), random_scans(8)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(8)
     drive(odometer, scans[:5])
     assert odometer.step(scans[5], 1e308, ANGLES).degraded.startswith("clock set: from 0.4 to 1e+308 s")
     odometer.reset()
@@ -425,14 +429,14 @@ def test_wild_stamps_and_angles_do_not_raise(recorder):
 
 
 def test_one_scan_without_a_stamp_does_not_forget_the_others(recorder):
-    odometer, scans = Odometer(recorder), random_scans(4)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(4)
     for scan, stamp in zip(scans[:3], (1.0, 1.1, None), strict=True):
         odometer.step(scan, stamp, ANGLES)
     assert "late scan" in odometer.step(scans[3], 0.5, ANGLES).degraded
 
 
 def test_a_network_that_gives_nan_starts_anew(recorder):
-    odometer, scans = Odometer(recorder), random_scans(6)
+    odometer, scans = Odometer(PairTracker(recorder)), random_scans(6)
     drive(odometer, scans[:4])
     recorder.step = np.array([np.nan, 0.0, 0.1])
     broken = odometer.step(scans[4], 0.4, ANGLES)
@@ -444,15 +448,15 @@ def test_a_network_that_gives_nan_starts_anew(recorder):
 
 def test_without_stamps_the_order_counts():
     scans = random_scans(5)
-    odometer = Odometer(Remembering())
-    expected = drive(Odometer(Remembering()), scans)
+    odometer = Odometer(PairTracker(Remembering()))
+    expected = drive(Odometer(PairTracker(Remembering())), scans)
     for scan, pose in zip(scans, expected, strict=True):
         got = odometer.step(scan, float("nan"), ANGLES)
         assert (got.x, got.y, got.stamp, got.degraded) == (pose.x, pose.y, None, "")
 
 
 def test_another_number_of_beams_is_told_and_goes_on(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(3))
     pose = odometer.step(np.full(361, 5.0), 0.3)
     assert pose.degraded == "beam count: 361 after 181"
@@ -463,7 +467,7 @@ def test_another_number_of_beams_is_told_and_goes_on(recorder):
 
 
 def test_returns_alone_change_their_number_and_that_is_nothing(recorder):
-    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    odometer, rng = Odometer(PairTracker(recorder)), np.random.default_rng(0)
     for number in range(20):
         returned = rng.random(181) < 0.9
         pose = odometer.step(np.full(returned.sum(), 5.0), 0.1 * number, ANGLES[returned])
@@ -473,7 +477,7 @@ def test_returns_alone_change_their_number_and_that_is_nothing(recorder):
 
 
 def test_few_returns_are_told(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(3))
     few = np.where(np.arange(181) < 60, 5.0, 0.0)
     pose = odometer.step(few, 0.3)
@@ -482,7 +486,7 @@ def test_few_returns_are_told(recorder):
 
 
 def test_a_jittering_clock_is_no_gap(recorder):
-    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    odometer, rng = Odometer(PairTracker(recorder)), np.random.default_rng(0)
     for number, scan in enumerate(random_scans(50)):
         pose = odometer.step(scan, PERIOD * number + rng.uniform(-0.02, 0.02), ANGLES)
         assert pose.degraded == ""
@@ -490,7 +494,7 @@ def test_a_jittering_clock_is_no_gap(recorder):
 
 @pytest.mark.slow
 def test_memory_does_not_grow(recorder):
-    scans, odometer = random_scans(20), Odometer(recorder)
+    scans, odometer = random_scans(20), Odometer(PairTracker(recorder))
     recorder.pairs = type("", (), {"append": lambda self, pair: None})()
     drive(odometer, scans)
     tracemalloc.start()
@@ -505,16 +509,16 @@ def test_memory_does_not_grow(recorder):
 
 def test_what_is_not_known_of_a_step_is_null_in_json(recorder):
     recorder.covariance = np.diag([0.25, np.nan, 0.01])
-    pose = drive(Odometer(recorder), random_scans(2))[1].as_dict()
+    pose = drive(Odometer(PairTracker(recorder)), random_scans(2))[1].as_dict()
     assert pose == json.loads(json.dumps(pose))
-    assert list(pose) == ["stamp", "x", "y", "heading", "step", "covariance", "degraded"]
+    assert list(pose) == ["stamp", "x", "y", "heading", "step", "covariance", "pose_covariance", "degraded"]
     assert pose["step"] == recorder.step.tolist()
     assert pose["covariance"] == [[0.25, 0.0, 0.0], [0.0, None, 0.0], [0.0, 0.0, 0.01]]
 
 
 def test_a_held_step_of_unknown_size_is_known_of_nothing(recorder):
     recorder.description = replace(Recorder.description, typical_step=(0.6, np.nan, 0.03))
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     drive(odometer, random_scans(3))
     covariance = odometer.step(np.zeros(181), 0.3).step.covariance
     expected = [[0.36, np.nan, 0.0], [np.nan] * 3, [0.0, np.nan, 0.0009]]
@@ -523,7 +527,7 @@ def test_a_held_step_of_unknown_size_is_known_of_nothing(recorder):
 
 def test_scans_with_bearings_of_their_own(recorder):
     """The same beams clockwise, counter-clockwise, and beginning behind: one stream, nothing unusual."""
-    odometer, values = Odometer(recorder), random_scans(4).astype(np.float64)
+    odometer, values = Odometer(PairTracker(recorder)), random_scans(4).astype(np.float64)
     poses = [
         odometer.step(Scan(values[0], ANGLES, stamp=0.0)),
         odometer.step(Scan(values[1][::-1], ANGLES[::-1], stamp=0.1)),
@@ -536,7 +540,7 @@ def test_scans_with_bearings_of_their_own(recorder):
 
 
 def test_points_say_nothing_of_the_beams(recorder):
-    odometer, rng = Odometer(recorder), np.random.default_rng(0)
+    odometer, rng = Odometer(PairTracker(recorder)), np.random.default_rng(0)
     for number in range(10):
         bearings = np.sort(rng.uniform(-1.5, 1.5, 181 - number))
         points = 5 * np.column_stack([np.cos(bearings), np.sin(bearings)])
@@ -544,7 +548,7 @@ def test_points_say_nothing_of_the_beams(recorder):
 
 
 def test_returns_are_those_of_the_last_scan_alone(recorder):
-    odometer = Odometer(recorder)
+    odometer = Odometer(PairTracker(recorder))
     assert odometer.returns().shape == (0, 2)
     wall = np.full(181, 5.0)
     pose = drive(odometer, [wall, wall])[-1]
@@ -578,11 +582,97 @@ def test_a_checkpoint_says_that_it_is_exported_first():
 )
 def test_shapes_that_are_no_scan(recorder, scan, angles):
     with pytest.raises(ValueError, match=r"a scan is ranges|points are"):
-        Odometer(recorder).step(scan, angles=angles)
+        Odometer(PairTracker(recorder)).step(scan, angles=angles)
 
 
 def test_a_file_of_another_sensor_is_refused():
-    sensor = Odometer.from_onnx("rcnn_small").description.sensor
+    sensor = Odometer.from_onnx("rcnn_small").sensor
     assert Odometer.from_onnx("rcnn_small", sensor=sensor)
     with pytest.raises(InputError, match=r"made for .*360.*, not .*180"):
         Odometer.from_onnx("rcnn_small", sensor=Sensor(1.0, 180.0, 40.0))
+
+
+# --- poses of a robot, and how far off they are -----------------------------------------------------
+
+
+class AnyLaser:
+    """A model of whole scans that always answers the same."""
+
+    period = float("nan")
+    step = Step(0.4, -0.1, 0.3, np.diag([0.02, 0.01, 0.005]) ** 2)
+
+    def __init__(self):
+        self.reset()
+
+    def reset(self):
+        self.has_seen, self.scan = False, None
+
+    def begin(self, scan):
+        self.has_seen, self.scan = True, scan
+        return ()
+
+    def register(self, scan, periods=1, seconds=None):
+        self.scan = scan
+        return Registered(self.step, is_estimated=periods == 1)
+
+    def returns(self):
+        ranges, bearings = self.scan.ranges, self.scan.bearings
+        return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
+
+
+def test_the_covariance_of_a_pose_is_that_of_its_steps():
+    odometer = Odometer(AnyLaser())
+    poses = drive(odometer, random_scans(6))
+    covariance, pose = np.zeros((3, 3)), np.zeros(3)
+    np.testing.assert_array_equal(poses[0].covariance, covariance)
+    for each in poses[1:]:
+        covariance = compound_covariance(pose, covariance, AnyLaser.step)
+        pose = advance(pose, AnyLaser.step.array())
+        np.testing.assert_allclose(each.covariance, covariance)
+    assert (np.diff([np.trace(each.covariance) for each in poses]) > 0).all()
+    late = odometer.step(random_scans(1)[0], 0.2, ANGLES)
+    np.testing.assert_array_equal(late.covariance, covariance)
+    assert odometer.estimates == 5
+    unknown = odometer.step(random_scans(1)[0], 1e6, ANGLES)
+    assert np.isnan(unknown.covariance).all(), "after a set clock nobody knows"
+    assert np.isnan(odometer.step(random_scans(1)[0], 1e6 + 0.1, ANGLES).covariance).all()
+    odometer.reset()
+    assert not odometer.step(random_scans(1)[0], 0.0, ANGLES).covariance.any()
+
+
+def test_the_robot_moves_where_its_laser_does_not():
+    """By products of matrices: the laser sits ahead and aside, and looks backwards."""
+    laser_pose = (0.6, -0.2, 3.0)
+    odometer = Odometer(AnyLaser(), laser_pose)
+    wall = np.full(181, 5.0)
+    on_robot, step = planar_to_poses([laser_pose, AnyLaser.step.array()])
+    robot = np.eye(4)
+    for number, pose in enumerate(drive(odometer, [wall] * 5)):
+        if number:
+            robot = robot @ on_robot @ step @ np.linalg.inv(on_robot)
+        np.testing.assert_allclose(pose.matrix(), robot, atol=1e-12)
+    laser = robot @ on_robot
+    expected = laser[:2, 3] + 5 * np.column_stack([np.cos(ANGLES), np.sin(ANGLES)]) @ laser[:2, :2].T
+    np.testing.assert_allclose(odometer.returns(), expected, atol=1e-5)
+    moved = planar_to_poses(pose.step.array()[None])[0]
+    np.testing.assert_allclose(np.linalg.inv(on_robot) @ moved @ on_robot, step, atol=1e-12)
+    assert pose.step.covariance[1, 1] > AnyLaser.step.covariance[1, 1], "the turn moves the robot too"
+
+
+def test_any_laser_has_to_say_where_its_beams_lie():
+    odometer = Odometer(AnyLaser())
+    with pytest.raises(ValueError, match="give the angles of the beams"):
+        odometer.step(np.full(181, 5.0))
+    assert (odometer.beam_check, odometer.sensor) == (None, None)
+    assert Odometer(PairTracker(Recorder())).sensor == Recorder.description.sensor
+
+
+def test_the_default_is_scan_matching_and_costs_nothing_to_import():
+    heavy = "{'torch', 'numba', 'scipy', 'onnxruntime'} & sys.modules.keys()"
+    code = f"""import sys
+from rcnn_odom.deployment.odometer import Odometer
+assert not {heavy}, {heavy}
+assert type(Odometer().tracker).__name__ == "MatcherTracker"
+assert "torch" not in sys.modules
+"""
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)

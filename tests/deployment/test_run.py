@@ -16,7 +16,20 @@ import pytest
 import torch
 
 from conftest import ROOT, SHARED
-from data.make_bag import FORMATS, make_bag
+from data.make_bag import (
+    FORMATS,
+    ODOMETRY,
+    SCAN,
+    START,
+    TRANSFORMS,
+    arrival_of,
+    laser_scan,
+    make_bag,
+    odometry,
+    static_transforms,
+    store_of,
+    write_bag,
+)
 from data.make_carmen import make_carmen
 from data.make_kitti import TR, make_kitti
 from odometry import SENSOR, build, random_scans
@@ -25,11 +38,11 @@ from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.run import run
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, Step, change_frame, planar_to_poses, relative_steps
-from rcnn_odom.models.contract import Description
+from rcnn_odom.models.contract import Description, Registered, find_model
 from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.models.icp import ICP
-from rcnn_odom.recordings import carmen
-from rcnn_odom.recordings.formats import open_stream
+from rcnn_odom.models.pairs import PairTracker
+from rcnn_odom.recordings import carmen, kitti
+from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import read_kitti, read_tum
@@ -67,7 +80,7 @@ def steps_in(out):
 def test_a_carmen_log_gives_the_poses_of_the_odometer(model, tmp_path, capsys):
     make_carmen(tmp_path, "robot", frames=30)
     out = tmp_path / "out"
-    assert main(["run", model, str(tmp_path / "robot.log"), "--out", str(out)]) == 0
+    assert main(["run", "--model", model, str(tmp_path / "robot.log"), "--out", str(out)]) == 0
     assert {path.name for path in out.iterdir()} == FILES
     sequence, odometer = carmen.load("robot", root=tmp_path), Odometer.from_onnx(model)
     expected = []
@@ -95,8 +108,8 @@ def test_a_checkpoint_is_exported_and_run(tmp_path):
     torch.save(saved, tmp_path / "best.ckpt")
     scans = random_scans(6)
     bag, out = make_bag(tmp_path, "mcap", scans), tmp_path / "out"
-    assert main(["run", str(tmp_path / "best.ckpt"), str(bag), "--out", str(out)]) == 0
-    odometer = Odometer(network.stepper())
+    assert main(["run", "--model", str(tmp_path / "best.ckpt"), str(bag), "--out", str(out)]) == 0
+    odometer = Odometer(network.tracker())
     expected = [odometer.step(scan).x for scan in scans.astype(np.float64)]
     np.testing.assert_allclose([step["x"] for step in steps_in(out)], expected, atol=1e-4)
 
@@ -105,7 +118,7 @@ def test_a_checkpoint_is_exported_and_run(tmp_path):
 def test_bags_of_all_kinds(model, tmp_path, kind):
     scans = random_scans(15)
     out = tmp_path / "out"
-    assert main(["run", model, str(make_bag(tmp_path, kind, scans)), "--out", str(out)]) == 0
+    assert main(["run", "--model", model, str(make_bag(tmp_path, kind, scans)), "--out", str(out)]) == 0
     odometer = Odometer.from_onnx(model)
     # The angles of a LaserScan are in single precision.
     expected = [odometer.step(scan) for scan in scans.astype(np.float64)]
@@ -117,7 +130,7 @@ def test_bags_of_all_kinds(model, tmp_path, kind):
 def test_a_kitti_folder_is_written_in_its_camera_frame(velodyne, tmp_path):
     make_kitti(tmp_path, ["05"], frames=12)
     out = tmp_path / "out"
-    assert main(["run", velodyne, str(tmp_path / "sequences" / "05"), "--out", str(out)]) == 0
+    assert main(["run", "--model", velodyne, str(tmp_path / "sequences" / "05"), "--out", str(out)]) == 0
     steps = steps_in(out)
     expected = planar_to_poses([[step["x"], step["y"], step["heading"]] for step in steps])
     np.testing.assert_allclose(read_kitti(out / "trajectory.txt"), change_frame(expected, TR), atol=1e-9)
@@ -127,17 +140,19 @@ def test_a_kitti_folder_is_written_in_its_camera_frame(velodyne, tmp_path):
 def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
     bag = str(make_bag(tmp_path, "mcap", random_scans(5), ("/a", "/b")))
     out = tmp_path / "out"
-    assert main(["run", model, bag, "--out", str(out)]) == 1
+    assert main(["run", "--model", model, bag, "--out", str(out)]) == 1
     assert "choose one with --topic: /a, /b" in capsys.readouterr().err
-    assert main(["run", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
-    assert "the sensor's all round, one every 0.5 (frame laser); train a model on" in capsys.readouterr().err
+    assert main(["run", "--model", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
+    assert (
+        "the sensor's all round, one every 0.5 (frame laser); take --model matcher" in capsys.readouterr().err
+    )
     assert not out.exists()
-    assert main(["run", model, bag, "--out", str(out), "--topic", "/a"]) == 0
+    assert main(["run", "--model", model, bag, "--out", str(out), "--topic", "/a"]) == 0
 
 
 def test_what_is_there_is_not_overwritten(model, tmp_path, capsys):
     make_carmen(tmp_path, "robot", frames=5)
-    command = ["run", model, str(tmp_path / "robot.log"), "--out", str(tmp_path / "out")]
+    command = ["run", "--model", model, str(tmp_path / "robot.log"), "--out", str(tmp_path / "out")]
     assert main(command) == 0
     before = (tmp_path / "out" / "trajectory.txt").read_bytes()
     assert main(command) == 1
@@ -153,7 +168,7 @@ def test_a_log_that_breaks_off_leaves_valid_files(model, tmp_path, capsys):
     log = tmp_path / "robot.log.gz"
     log.write_bytes(log.read_bytes()[:-2000])
     out = tmp_path / "out"
-    assert main(["run", model, str(log), "--out", str(out)]) == 1
+    assert main(["run", "--model", model, str(log), "--out", str(out)]) == 1
     assert "cannot be read to its end" in capsys.readouterr().err
     summary = json.loads((out / "summary.json").read_text())
     assert "cannot be read to its end" in summary["stopped"]
@@ -171,7 +186,14 @@ def start(*arguments, **options):
 def test_live_answers_each_line_at_once(model, tmp_path):
     scans = random_scans(6).astype(np.float64)
     process = start(
-        "run", model, "--live", "--out", tmp_path / "out", stdin=subprocess.PIPE, stdout=subprocess.PIPE
+        "run",
+        "--model",
+        model,
+        "--live",
+        "--out",
+        tmp_path / "out",
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
     )
     odometer = Odometer.from_onnx(model)
     for number, scan in enumerate(scans):
@@ -192,7 +214,14 @@ def test_live_answers_each_line_at_once(model, tmp_path):
 
 def test_a_killed_run_leaves_whole_lines(model, tmp_path):
     process = start(
-        "run", model, "--live", "--out", tmp_path / "out", stdin=subprocess.PIPE, stdout=subprocess.DEVNULL
+        "run",
+        "--model",
+        model,
+        "--live",
+        "--out",
+        tmp_path / "out",
+        stdin=subprocess.PIPE,
+        stdout=subprocess.DEVNULL,
     )
     line = json.dumps({"ranges": random_scans(1)[0].tolist()}) + "\n"
     for _ in range(20):
@@ -213,7 +242,7 @@ def test_a_killed_run_leaves_whole_lines(model, tmp_path):
 def test_bytes_that_are_no_text_are_a_line_that_is_no_scan(model):
     good = json.dumps({"ranges": random_scans(1)[0].tolist()}).encode()
     done = subprocess.run(
-        [sys.executable, "-m", "rcnn_odom.cli", "run", model, "--live"],
+        [sys.executable, "-m", "rcnn_odom.cli", "run", "--model", model, "--live"],
         input=b"\n".join([good, b"\xff\xfe{", good]),
         capture_output=True,
         env={**os.environ, "PYTHONIOENCODING": "utf-8:strict"},
@@ -229,40 +258,81 @@ def test_an_empty_first_scan_says_nothing_of_the_laser(model, monkeypatch, capsy
     )
     empty = json.dumps({"ranges": [], "angle_min": -1.5708, "angle_increment": 0.0174533})
     monkeypatch.setattr(sys, "stdin", iter([empty, good]))
-    assert main(["run", model, "--live"]) == 0
+    assert main(["run", "--model", model, "--live"]) == 0
     assert len(capsys.readouterr().out.splitlines()) == 2
 
 
 def test_live_without_a_scan(model, capsys, monkeypatch):
     monkeypatch.setattr(sys, "stdin", iter(()))
-    assert main(["run", model, "--live"]) == 1
+    assert main(["run", "--model", model, "--live"]) == 1
     assert "standard input: no scan in it" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        ([], "give MODEL and either INPUT or --live"),
-        (["a", "--live"], "either INPUT or --live"),
-        (["a", "--model", "b"], "either INPUT or --live"),
+        ([], "give one INPUT or --live"),
+        (["a", "--live", "--model", "rcnn_small"], "give one INPUT or --live"),
+        (["a", "b", "--model", "rcnn_small"], "give one INPUT or --live"),
+        (["a.bag", "b.bag", "--out", "x"], "give one INPUT or --live"),
         (["a"], "--out DIR is needed"),
+        (["a", "--out", "x", "--threads", "2"], "--threads is of a network (--model), not of the matcher"),
+        (
+            ["a", "--out", "x", "--model", "b.onnx", "--wheels"],
+            "--wheels is of the matcher, not of a network",
+        ),
+        (["a", "--out", "x", "--model", "b.onnx", "--deskew", "on"], "--deskew is of the matcher"),
+        (
+            ["a", "--out", "x", "--model", "rcnn_small", "--odom-topic", "/odom"],
+            "--odom-topic is of the matcher",
+        ),
+        (["a", "--out", "x", "--deskew", "perhaps"], "invalid choice: 'perhaps'"),
+        (["--live", "--ring", "3"], "--ring is of recordings, not of --live"),
+        (["--live", "--base", "base_link"], "--base is of recordings, not of --live"),
+        (["--live", "--wheels"], "--wheels is of recordings, not of --live"),
+        (["a", "--out", "x", "--base", "b", "--laser-pose", "1", "0", "0"], "say the same; give one of them"),
+        (["a", "--out", "x", "--wheels", "--odom-topic", "/o"], "are two odometries; give one of them"),
+        (
+            ["a", "--out", "x", "--laser-pose", "1", "2"],
+            "'1 2' is not three numbers, metres, metres and degrees",
+        ),
+        (["a", "--out", "x", "--laser-pose", "1", "2", "nan"], "is not three numbers"),
+        (["a", "--out", "x", "--every", "0"], "'0' is not a whole number, 1 or more"),
     ],
 )
-def test_wrong_usage(model, arguments, message, capsys):
+def test_wrong_usage(arguments, message, capsys):
     with pytest.raises(SystemExit) as stopped:
-        main(["run", model, *arguments])
+        main(["run", *arguments])
     assert stopped.value.code == 2
     assert message in capsys.readouterr().err
 
 
-def test_the_model_may_be_named_by_an_option(model, tmp_path, capsys):
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        (["rcnn_small", "my drive", "--out", "x"], "rcnn-odom run 'my drive' --model rcnn_small --out x"),
+        (["RUN/best.ckpt", "a.bag", "--out", "x"], "rcnn-odom run a.bag --model RUN/best.ckpt --out x"),
+        (["--live", "net.onnx"], "rcnn-odom run --model net.onnx --live"),
+        (
+            ["a.onnx", "b.bag", "--out", "x", "--height", "-0.1:0.1", "--laser-pose", "-1", "0", "90"],
+            "rcnn-odom run b.bag --model a.onnx --out x --laser-pose -1 0 90 --height -0.1:0.1",
+        ),
+    ],
+)
+def test_the_order_of_earlier_versions_is_answered_with_the_new_command(old, new, capsys):
+    assert main(["run", *old]) == 1
+    answer = capsys.readouterr().err
+    assert answer == (f"rcnn-odom: error: the recording comes first, and the model is an option: {new}\n")
+
+
+def test_a_recording_that_is_not_there(model, tmp_path, capsys):
     assert main(["run", str(tmp_path / "none"), "--model", model, "--out", str(tmp_path / "out")]) == 1
     assert "no such file or folder" in capsys.readouterr().err
 
 
 def test_models_that_are_none(tmp_path, capsys):
     for model in ("rcnn_huge", str(tmp_path / "none.ckpt")):
-        assert main(["run", model, str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+        assert main(["run", "--model", model, str(tmp_path), "--out", str(tmp_path / "out")]) == 1
         assert "no such" in capsys.readouterr().err
 
 
@@ -313,9 +383,9 @@ def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_pa
     message, written = start_of(scans_of(*[np.arange(0.0, 180.0)] * 40), model, tmp_path / "out")
     assert message == (
         "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
-        "degrees, one every 1; train a model on recordings of such a laser "
-        "(python train.py data=... data.sensor.field_of_view_deg=180 data.sensor.resolution_deg=1 "
-        "data.sensor.facing_deg=90), or give another recording"
+        "degrees, one every 1; take --model matcher, which fits any laser, or train a model on recordings of "
+        "such a laser (python train.py data=... data.sensor.field_of_view_deg=180 "
+        "data.sensor.resolution_deg=1 data.sensor.facing_deg=90)"
     )
     assert written == 0
     assert not (tmp_path / "out").exists()
@@ -385,7 +455,7 @@ def case(name):
     ],
 )
 def test_cases_that_are_read(tmp_path, name, scans, metres, degraded):
-    assert main(["run", "rcnn_small", str(case(name)), "--out", str(tmp_path / "out")]) == 0
+    assert main(["run", "--model", "rcnn_small", str(case(name)), "--out", str(tmp_path / "out")]) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["scans"], summary["degraded"]) == (scans, degraded)
     assert summary["path_m"] == pytest.approx(metres, rel=0.02)
@@ -393,30 +463,40 @@ def test_cases_that_are_read(tmp_path, name, scans, metres, degraded):
 
 def test_a_laser_that_sees_the_left_half_is_refused_or_read_whole(model, tmp_path, capsys):
     path, sensor = case("left_half.bag"), Sensor(1.0, 180.0, 80.0, facing_deg=90)
-    assert main(["run", model, str(path), "--out", str(tmp_path / "out")]) == 1
+    assert main(["run", "--model", model, str(path), "--out", str(tmp_path / "out")]) == 1
     assert "its beams lie from 0 to 179 degrees" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
     write(to_onnx(build(sensor=sensor), "fp32"), tmp_path / "left.onnx")
-    assert main(["run", str(tmp_path / "left.onnx"), str(path), "--out", str(tmp_path / "out")]) == 0
+    assert (
+        main(["run", "--model", str(tmp_path / "left.onnx"), str(path), "--out", str(tmp_path / "out")]) == 0
+    )
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert summary["scans"] == 120
     assert not {"other laser", "few returns"} & summary["degraded"].keys()
 
 
-def test_scan_matching_of_the_left_half_follows_the_drive():
+def test_scan_matching_of_the_left_half_follows_the_drive(tmp_path):
     """The same drive as a log's, whose poses are the reference: 1.26 rad of turns on 5.8 m."""
-    sensor = Sensor(1.0, 180.0, 80.0, facing_deg=90)
-    stepper = ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, sensor).stepper()
-    scans = list(open_stream(case("left_half.bag")).scans)
-    depths = [sensor.encode(scan) for scan in scans]
-    for scan, depth in zip(scans, depths, strict=True):
-        returned = (scan.ranges > 0) & (scan.ranges < sensor.max_range)
-        assert np.count_nonzero(depth) == np.count_nonzero(returned), "no beam is dropped"
-    steps = np.array([stepper(np.stack(pair)).array() for pair in pairwise(depths)])
+    assert main(["run", str(case("left_half.bag")), "--out", str(tmp_path / "out")]) == 0
+    steps = np.array([step["step"] for step in steps_in(tmp_path / "out")[1:]])
     truth = carmen.load("robotlaser_neg_res", root=case("robotlaser_neg_res.log.gz").parent)
     expected = relative_steps(truth.poses)
     assert np.abs(steps[:, 2]).sum() == pytest.approx(np.abs(expected[:, 2]).sum(), rel=0.05)
     assert np.hypot(*steps[:, :2].T).sum() == pytest.approx(np.hypot(*expected[:, :2].T).sum(), rel=0.1)
+
+
+def test_a_whole_drive_has_the_poses_of_the_command(tmp_path):
+    """`evaluate.py model=matcher` estimates with this, the command with a stream."""
+    make_kitti(tmp_path, ["05"], frames=15)
+    out = tmp_path / "out"
+    assert main(["run", str(tmp_path / "sequences" / "05"), "--out", str(out)]) == 0
+    drive = Drive.unencoded(kitti.load("05", root=tmp_path))
+    estimate = find_model("matcher")({}, SENSOR).estimate(drive)
+    streamed = np.array([step["step"] for step in steps_in(out)])
+    np.testing.assert_array_equal(streamed[1:], estimate.values)
+    assert np.abs(streamed[1:]).sum() > 1
+    covariances = np.array([step["covariance"] for step in steps_in(out)], dtype=float)
+    np.testing.assert_array_equal(covariances[1:], estimate.covariances)
 
 
 @pytest.mark.slow
@@ -445,7 +525,7 @@ def test_the_map_shows_walls_where_they_are(tmp_path):
     """With true motions the scans of a square room lie on each other."""
     from rcnn_odom.evaluation.figures import map_figure
 
-    odometer = Odometer(_Straight())
+    odometer = Odometer(PairTracker(_Straight()))
     points, poses = [], []
     angles = np.deg2rad(np.arange(360) - 180.0)
     for step in range(5):
@@ -477,7 +557,7 @@ def test_the_map_has_no_ghosts(monkeypatch, tmp_path):
     wall = [np.where(x > 0.3, (10 - 0.5 * n) / x, 0.0) for n in range(3)]  # it is 10 m ahead at first
     rows = [Scan(scan, angles, stamp=0.1 * n) for n, scan in enumerate([*wall, *[np.zeros(360)] * 5])]
     rows.insert(3, Scan(wall[0], angles, stamp=0.1))  # late
-    run(Odometer(_Straight()), ScanStream("room", iter(rows)), "straight", tmp_path / "out")
+    run(Odometer(PairTracker(_Straight())), ScanStream("room", iter(rows)), "straight", tmp_path / "out")
     assert [len(points) > 0 for points in drawn] == [True] * 3 + [False] * 6
     np.testing.assert_allclose(np.concatenate(drawn)[:, 0], 10.0, atol=0.1)
 
@@ -495,7 +575,7 @@ class _Straight:
 
 def test_errors_inside_are_not_hidden(model, tmp_path):
     class Broken:
-        description = Odometer.from_onnx(model).description
+        description = Odometer.from_onnx(model).tracker.description
 
         def reset(self):
             pass
@@ -505,7 +585,7 @@ def test_errors_inside_are_not_hidden(model, tmp_path):
 
     rows = [Scan(scan) for scan in random_scans(3)]
     with pytest.raises(RuntimeError):
-        run(Odometer(Broken()), ScanStream("log", iter(rows)), "tiny", tmp_path / "out")
+        run(Odometer(PairTracker(Broken())), ScanStream("log", iter(rows)), "tiny", tmp_path / "out")
     assert len(read_kitti(tmp_path / "out" / "trajectory.txt")) == 1
     assert json.loads((tmp_path / "out" / "summary.json").read_text())["stopped"] == "a fault of the program"
     with pytest.raises(InputError):
@@ -523,15 +603,232 @@ def test_encoded_points_are_decoded_to_where_they_were():
     np.testing.assert_allclose(decode(backwards, Sensor(0.5, 360.0, 80.0)), [[-3.0, 0.0]], atol=1e-6)
 
 
+# --- without a network ---------------------------------------------------------------------------
+
+
+class Asked:
+    """A stand-in for the matcher: half a metre ahead and a small turn, whatever it sees."""
+
+    period = float("nan")
+    step = Step(0.5, 0.0, 0.1, np.diag([0.01, 0.02, 0.03]) ** 2)
+    made = ()
+
+    def __init__(self, wheels=False, deskew=True):
+        Asked.made = (wheels, deskew)
+        self.wheel_poses = []
+        self.reset()
+
+    def reset(self):
+        self.has_seen, self._points = False, np.empty((0, 2))
+
+    def begin(self, scan):
+        self.has_seen = bool((scan.ranges > 0).any())
+        return ()
+
+    def register(self, scan, periods=1, seconds=None):
+        self._points = np.column_stack(
+            [scan.ranges * np.cos(scan.bearings), scan.ranges * np.sin(scan.bearings)]
+        )
+        return Registered(self.step)
+
+    def returns(self):
+        return self._points
+
+
+@pytest.fixture
+def asked(monkeypatch):
+    """The command with a stand-in in place of the matcher."""
+    monkeypatch.setattr("rcnn_odom.models.matcher.MatcherTracker", Asked)
+    return Asked
+
+
+def test_without_a_model_it_is_the_matcher_for_any_laser(asked, tmp_path, capsys):
+    """A laser of 91 beams aside, which fits no shipped network."""
+    angles = np.deg2rad(np.arange(0.0, 91.0))
+    lines = [
+        {"stamp": 0.1 * n, "ranges": [5.0] * 91, "angle_min": 0.0, "angle_increment": float(angles[1])}
+        for n in range(8)
+    ]
+    (tmp_path / "scans.jsonl").write_text("\n".join(map(json.dumps, lines)))
+    assert main(["run", str(tmp_path / "scans.jsonl"), "--out", str(tmp_path / "out")]) == 0
+    assert {path.name for path in (tmp_path / "out").iterdir()} == FILES
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert (summary["model"], summary["scans"], summary["laser_pose"]) == ("matcher", 8, None)
+    assert summary["path_m"] == pytest.approx(3.5)
+    assert asked.made == (False, True)
+    printed = capsys.readouterr().out
+    assert "scans.jsonl: 8 scans, 3.5 m by matcher" in printed
+    covariance = np.array(steps_in(tmp_path / "out")[-1]["pose_covariance"])
+    assert np.linalg.eigvalsh(covariance).min() > 0
+
+
+@pytest.mark.parametrize(
+    ("words", "compensated", "deskew"),
+    [([], False, True), ([], True, False), (["on"], True, True), (["off"], False, False)],
+)
+def test_deskewing_is_left_out_where_the_recording_has_done_it(
+    asked, monkeypatch, tmp_path, words, compensated, deskew
+):
+    stream = replace(scans_of(*[FULL] * 4), is_compensated=compensated)
+    monkeypatch.setattr("rcnn_odom.recordings.formats.open_stream", lambda path, options: stream)
+    options = ["--deskew", *words] if words else []
+    assert main(["run", "drive", "--out", str(tmp_path / "out"), *options]) == 0
+    assert asked.made == (False, deskew)
+
+
+def test_every_third_scan_in_two_ways(asked, tmp_path, capsys):
+    make_carmen(tmp_path, "robot", frames=31)
+    log = str(tmp_path / "robot.log")
+    for arguments in ([log, "--every", "3"], [f"{log}[::3]"]):
+        out = tmp_path / f"out{len(arguments)}"
+        assert main(["run", *arguments, "--out", str(out)]) == 0
+        stamps = carmen.load("robot", root=tmp_path).stamps[::3]
+        assert [step["stamp"] for step in steps_in(out)] == stamps.tolist()
+    with pytest.raises(SystemExit):
+        main(["run", f"{log}[::3]", "--every", "3", "--out", str(tmp_path / "b")])
+    assert "--every and [::3] say the same" in capsys.readouterr().err
+
+
+def test_the_poses_of_a_robot_whose_laser_sits_aside(asked, tmp_path, capsys):
+    """The robot's motion is worked out with matrices."""
+    make_carmen(tmp_path, "robot", frames=12)
+    command = ["run", str(tmp_path / "robot.log"), "--laser-pose", "-0.3", "0.1", "-90"]
+    assert main([*command, "--out", str(tmp_path / "out")]) == 0
+    on_robot, step = planar_to_poses([[-0.3, 0.1, -np.pi / 2], [0.5, 0.0, 0.1]])
+    poses = [np.eye(4)]
+    for _ in range(11):
+        poses.append(poses[-1] @ on_robot @ step @ np.linalg.inv(on_robot))
+    steps = steps_in(tmp_path / "out")
+    got = planar_to_poses([[each["x"], each["y"], each["heading"]] for each in steps])
+    np.testing.assert_allclose(got, poses, atol=1e-9)
+    camera = change_frame(np.array(poses), FORWARD_CAMERA)
+    np.testing.assert_allclose(read_kitti(tmp_path / "out" / "trajectory.txt"), camera, atol=1e-9)
+    printed = capsys.readouterr().out
+    assert "poses of the robot, with its laser -0.3 m ahead, 0.1 m to the left, turned by -90 deg" in printed
+
+
+def test_the_wheels_of_a_log_or_none(asked, monkeypatch, tmp_path, capsys):
+    with_wheels = [Scan(np.full(181, 5.0), np.deg2rad(FULL), wheel_pose=(0.1 * n, 0, 0)) for n in range(5)]
+    for rows, status in ((with_wheels, 0), ([replace(each, wheel_pose=None) for each in with_wheels], 1)):
+        stream = ScanStream("robot.log", iter(rows))
+        monkeypatch.setattr("rcnn_odom.recordings.formats.open_stream", lambda path, options, it=stream: it)
+        assert main(["run", "robot.log", "--wheels", "--out", str(tmp_path / f"out{status}")]) == status
+    assert len(steps_in(tmp_path / "out0")) == 5
+    assert asked.made == (True, True)
+    assert "robot.log: has no odometry of the robot with its scans; leave --wheels out" in (
+        capsys.readouterr().err
+    )
+
+
+def test_a_bag_that_tells_of_its_robot(asked, monkeypatch, tmp_path, capsys):
+    """Its /tf_static by --base, and its odometry by --odom-topic, which is carried over to the laser."""
+    store, topics = store_of("mcap"), {"/scan": SCAN, "/tf_static": TRANSFORMS, "/odom": ODOMETRY}
+    messages = [
+        (
+            "/tf_static",
+            arrival_of(0),
+            static_transforms(store, {("base_link", "laser"): (0.2, -0.1, 0.3, 0, 0, 90)}, False),
+        )
+    ]
+    for number in range(6):
+        at = arrival_of(number)
+        scan = laser_scan(store, np.full(181, 5.0), START + 0.1 * number, 180.0, False, number)
+        wheels = odometry(store, (0.5 * number, 0.0, 0.0), START + 0.1 * number, False)
+        messages += [("/odom", at, wheels), ("/scan", at + 1, scan)]
+    bag = str(write_bag(tmp_path, "mcap", topics, messages))
+    seen, register = [], Asked.register
+    monkeypatch.setattr(
+        Asked, "register", lambda self, scan, *more: seen.append(scan.wheel_pose) or register(self, scan)
+    )
+    command = ["run", bag, "--base", "base_link", "--odom-topic", "/odom", "--out", str(tmp_path / "out")]
+    assert main(command) == 0
+    assert asked.made[0] is True
+    np.testing.assert_allclose(seen, [(0.5 * n + 0.2, -0.1, np.pi / 2) for n in range(1, 6)], atol=1e-6)
+    summary = json.loads((tmp_path / "out" / "summary.json").read_text())
+    assert summary["laser_pose"] == pytest.approx([0.2, -0.1, np.pi / 2])
+    on_robot, step = planar_to_poses([[0.2, -0.1, np.pi / 2], Asked.step.array()])
+    last = steps_in(tmp_path / "out")[1]
+    np.testing.assert_allclose(
+        planar_to_poses([[last["x"], last["y"], last["heading"]]])[0],
+        on_robot @ step @ np.linalg.inv(on_robot),
+        atol=1e-9,
+    )
+    seen.clear()
+    command = ["run", bag, "--odom-topic", "/odom", "--laser-pose", "1", "0", "0"]
+    assert main([*command, "--out", str(tmp_path / "out2")]) == 0
+    np.testing.assert_allclose(seen, [(0.5 * n + 1, 0, 0) for n in range(1, 6)], atol=1e-6)
+    assert main([*command[:2], "--base", "chassis", "--out", str(tmp_path / "out3")]) == 1
+    assert "/tf_static has no frame chassis, only base_link, laser" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("option", ["--base", "--odom-topic"])
+def test_an_option_of_bags_for_another_format(asked, tmp_path, capsys, option):
+    make_carmen(tmp_path, "robot", frames=5)
+    log = str(tmp_path / "robot.log")
+    assert main(["run", log, option, "/name", "--out", str(tmp_path / "out")]) == 1
+    name = option.removeprefix("--").replace("-", "_")
+    assert capsys.readouterr().err == (
+        f"rcnn-odom: error: {log}: read as carmen, which has no option {name}; leave it out\n"
+    )
+    assert not (tmp_path / "out").exists()
+
+
+def test_ranges_without_angles_are_refused(asked, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "stdin", iter([json.dumps({"ranges": [5.0] * 181})] * 2))
+    assert main(["run", "--live"]) == 1
+    assert "standard input: scan 1 has no angles; give angle_min and" in capsys.readouterr().err
+
+
+LINE = np.deg2rad(np.arange(-80.0, 81.0))
+BAD = {
+    "empty": [Scan(np.empty(0), np.empty(0))] * 9,
+    "all inf": [Scan(np.full(181, np.inf), np.deg2rad(FULL))] * 9,
+    "all nan": [Scan(np.full(181, np.nan), np.deg2rad(FULL))] * 9,
+    "one beam": [Scan(np.array([5.0 - 0.1 * n]), np.zeros(1)) for n in range(9)],
+    "a line": [Scan(3 / np.cos(LINE), LINE) for _ in range(9)],
+    "counts": [
+        Scan(np.full(60 + 40 * (n % 3), 5.0), np.linspace(-1, 1, 60 + 40 * (n % 3))) for n in range(9)
+    ],
+    "some nan": [Scan(np.where(np.arange(181) % 7 > n, 5.0, np.nan), np.deg2rad(FULL)) for n in range(9)],
+    "same way": [Scan(np.full(50, 5.0), np.zeros(50))] * 9,
+    "two frames": [Scan(np.full(181, 5.0), np.deg2rad(FULL), frame_id="ab"[n % 2]) for n in range(9)],
+}
+
+
+@pytest.mark.parametrize("stamps", ["even", "equal", "none", "backwards"])
+@pytest.mark.parametrize("kind", BAD)
+def test_bad_input_is_one_line_or_poses(tmp_path, kind, stamps):
+    """With the matcher itself, whatever it makes of it."""
+    times = {"even": 0.1 * np.arange(9), "equal": np.full(9, 5.0), "backwards": 9 - 0.1 * np.arange(9)}
+    of_scans = times.get(stamps, [None] * 9)
+    rows = [replace(scan, stamp=stamp) for scan, stamp in zip(BAD[kind], of_scans, strict=True)]
+    try:
+        summary = run(Odometer(), ScanStream("bad", iter(rows)), "matcher", tmp_path / "out")
+    except InputError as error:
+        refusal = str(error)
+    else:
+        refusal = ""
+    if refusal:
+        assert "\n" not in refusal
+        assert ";" in refusal
+        return
+    steps = steps_in(tmp_path / "out")
+    assert summary["scans"] == len(steps) == 9
+    assert np.isfinite([[step["x"], step["y"], step["heading"]] for step in steps]).all()
+
+
 BLOCKED = ("torch", "lightning", "pytorch_lightning", "hydra", "omegaconf")
 FORBID = f"import sys; sys.modules.update(dict.fromkeys({BLOCKED!r}))"
 
 
-def test_the_command_needs_no_pytorch(model, tmp_path):
-    make_carmen(tmp_path, "robot", frames=4)
-    command = ["run", model, str(tmp_path / "robot.log"), "--out", str(tmp_path / "out")]
-    code = f"{FORBID}; from rcnn_odom.cli import main; sys.exit(main({command!r}))"
+@pytest.mark.parametrize("words", [[], ["--model", "rcnn_small"]])
+def test_the_command_needs_no_pytorch(tmp_path, words):
+    make_kitti(tmp_path, ["05"], frames=4)
+    command = ["run", str(tmp_path / "sequences" / "05"), *words, "--out", str(tmp_path / "out")]
+    code = f"{FORBID}; from rcnn_odom.cli import main; main({command!r})"
+    code += "; sys.exit('onnxruntime' in sys.modules)" if not words else ""
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+    assert (tmp_path / "out" / "trajectory.txt").exists()
 
 
 def test_nothing_in_deployment_needs_pytorch_or_lightning(tmp_path):
@@ -542,8 +839,9 @@ import numpy as np
 
 from rcnn_odom.deployment import odometer, onnx_model, run, sampling, shipped
 from rcnn_odom.geometry import Step
-from rcnn_odom.models.contract import Description
+from rcnn_odom.models.contract import Description, Registered, find_model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 
@@ -560,7 +858,7 @@ class Straight:
 
 scans = (Scan(np.full(181, 5.0), stamp=0.1 * number) for number in range(4))
 stream, out = ScanStream("room", scans), Path({str(tmp_path)!r})
-summary = run.run(odometer.Odometer(Straight()), stream, "straight", out)
+summary = run.run(odometer.Odometer(PairTracker(Straight())), stream, "straight", out)
 assert (summary["scans"], summary["path_m"], summary["degraded"]) == (4, 1.5, {{}})
 assert not [name for name in {BLOCKED!r} if sys.modules[name]]
 """

@@ -56,7 +56,7 @@ def test_it_runs_on_real_frames(tmp_path, capsys):
     if not REAL.is_dir():
         pytest.skip(f"no real recordings at {REAL}")
     out = tmp_path / "out"
-    assert main(["run", "rcnn_small", str(REAL / "sequences" / "90"), "--out", str(out)]) == 0
+    assert main(["run", str(REAL / "sequences" / "90"), "--model", "rcnn_small", "--out", str(out)]) == 0
     steps = [json.loads(line) for line in (out / "steps.jsonl").read_text().splitlines()]
     truth = kitti.load("90", root=REAL)
     end = np.linalg.inv(truth.poses[0]) @ truth.poses[-1]

@@ -10,6 +10,7 @@ import pytest
 
 from rcnn_odom import registry
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.latency import measure
 from rcnn_odom.evaluation.metrics import Metric, all_metrics, frame_errors, planar_drift, score_metrics
 from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.evaluation.scores import (
@@ -247,6 +248,9 @@ def test_motions_are_read_as_they_were_written(tmp_path):
     np.testing.assert_array_equal(methods["held_motion"], held)
 
 
+LATENCY = {"median_ms": 1.0, "p99_ms": 2.0, "frames": 100, "threads": 1}
+
+
 class Standing:
     """A stepper that sees no motion, and counts."""
 
@@ -268,7 +272,7 @@ def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     data = {"name": "kitti", "lengths": [1.0], "apply": "end"}
     steps = Steps.with_unknown_covariance(steps_of([[0.875, 0.0], [1.25, -0.5]], "end"))
     mean = np.array([0.75, 0.0, 0.0])
-    report = report_drives("cnn_reg", {"05": steps}, mean, Standing(), [sequence], data, tmp_path)
+    report = report_drives("cnn_reg", {"05": steps}, mean, LATENCY, [sequence], data, tmp_path)
     header, first, second = (tmp_path / "trajectories" / "05_motions.csv").read_text().splitlines()
     assert header == (
         "frame,distance_m,heading_rad,true_distance_m,true_heading_rad,"
@@ -279,7 +283,7 @@ def test_a_report_leaves_the_motions_of_all_methods(tmp_path):
     # Driven at the end of the turn: projected on the heading in mid-turn, a quarter of a radian before.
     truth = 1.5 * np.cos(np.pi / 2 - 0.125)
     np.testing.assert_allclose(values, [2, 1.25 * np.cos(0.25), -0.5, truth, 0.25, 0.75, 0, 0, 0])
-    assert list(report) == ["test", "baselines", "latency", "versions"]
+    assert list(report) == ["test", "baselines", "latency", "path_ratio", "versions"]
 
 
 SIDEWAYS = [(frame, 0.5 * frame, 0.1 * (frame % 2)) for frame in range(31)]
@@ -308,9 +312,7 @@ def test_the_report_of_whole_steps_has_a_row_of_two_numbers_and_no_mean_motion(t
     estimated = {"05": Steps.with_unknown_covariance(steps)}
     data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
     figures = {}
-    report = report_drives(
-        "icp", estimated, None, Standing(), [sequence], data, tmp_path, figures.__setitem__
-    )
+    report = report_drives("icp", estimated, None, LATENCY, [sequence], data, tmp_path, figures.__setitem__)
     assert report["test"]["drift"] == pytest.approx(0, abs=1e-9)
     assert list(report["baselines"]) == ["held_motion", "icp_two_numbers"]
     assert {"numpy", "scipy", "numba"} <= set(report["versions"])
@@ -331,7 +333,7 @@ def test_rounding_to_single_precision_makes_no_row_of_two_numbers(tmp_path, appl
     rounded = in_two_numbers(sequence, apply).values.astype(np.float32)
     data = {"name": "kitti", "lengths": [10.0], "apply": apply}
     steps = {"05": Steps.with_unknown_covariance(rounded)}
-    report = report_drives("rcnn_reg", steps, None, Standing(), [sequence], data, tmp_path)
+    report = report_drives("rcnn_reg", steps, None, LATENCY, [sequence], data, tmp_path)
     assert list(report["baselines"]) == ["held_motion"]
 
 
@@ -341,7 +343,7 @@ def test_wheel_odometry_is_not_cut_to_two_numbers_either(tmp_path):
     sequence = replace(sequence, wheel_odometry=moved)
     data = {"name": "carmen", "lengths": [10.0], "apply": "end"}
     steps = {"05": held_motion().estimate(sequence)}
-    report = report_drives("icp", steps, None, Standing(), [sequence], data, tmp_path)
+    report = report_drives("icp", steps, None, LATENCY, [sequence], data, tmp_path)
     assert report["baselines"]["wheel_odometry"]["drift"] == pytest.approx(0, abs=1e-9)
 
 
@@ -350,9 +352,11 @@ def test_the_time_of_a_frame_is_that_of_a_stream(tmp_path):
     sequence = replace(sequence, scans=np.arange(390, dtype=np.float32).reshape(130, 3))
     data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
     stepper = Standing()
-    report = report_drives("x", {"05": ahead(130, 1.0)}, None, stepper, [sequence], data, tmp_path)
-    assert set(report["latency"]) == {"median_ms", "p99_ms", "frames", "threads"}
-    assert (report["latency"]["frames"], report["latency"]["threads"]) == (100, 1)
+    latency = measure(stepper, sequence.scans)
+    report = report_drives("x", {"05": ahead(130, 1.0)}, None, latency, [sequence], data, tmp_path)
+    assert report["latency"] == latency
+    assert set(latency) == {"median_ms", "p99_ms", "frames", "threads"}
+    assert (latency["frames"], latency["threads"]) == (100, 1)
     resets = [place for place, pair in enumerate(stepper.pairs) if pair is None]
     begin = resets[1] + 1  # after the frames that warm up
     measured = stepper.pairs[begin : begin + 100]
@@ -396,7 +400,7 @@ def test_coverage_by_hand(tmp_path):
     ]
     sequence = drive([(0, 0, 0), (1, 0, 0), (2, 0, 0), (3, 0, 0)], "05")
     data = {"name": "kitti", "lengths": [1.0], "apply": "middle"}
-    written = report_drives("net", {"05": steps}, None, Standing(), [sequence], data, tmp_path)
+    written = report_drives("net", {"05": steps}, None, LATENCY, [sequence], data, tmp_path)
     assert written["coverage"].keys() == {"05"}
     assert (tmp_path / "figures" / "coverage.png").exists()
 

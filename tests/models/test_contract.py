@@ -1,5 +1,9 @@
 """What every model has, whichever it is."""
 
+import subprocess
+import sys
+from dataclasses import dataclass
+
 import hydra
 import numpy as np
 import pytest
@@ -8,14 +12,16 @@ from hydra import initialize_config_dir
 from omegaconf import OmegaConf
 
 from conftest import ROOT
-from odometry import NAMES, SENSOR, build, options, random_scans
+from odometry import ANGLES, NAMES, SENSOR, build, options, random_scans
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, compose, relative_steps
 from rcnn_odom.models.contract import Model, all_models, check_model, find_model
+from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.models.two_numbers import steps_of
 from rcnn_odom.options import check_options
 from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training import settings  # noqa: F401  (what the files of conf look up)
 
 torch.set_num_threads(1)
@@ -38,12 +44,8 @@ def drive_of(scans, steps=None):
 
 
 def test_all_models_are_found_by_their_names():
-    assert sorted(all_models()) == ["cnn_cls", "cnn_reg", "icp", "rcnn_cls", "rcnn_reg"]
-    assert all(find_model(name).name == name for name in NAMES)
-    assert {name: model.trains for name, model in all_models().items()} == {
-        "icp": False,
-        **dict.fromkeys(NAMES, True),
-    }
+    assert all(find_model(name).name == name for name in (*NAMES, "matcher"))
+    assert {name for name, model in all_models().items() if model.trains} == set(NAMES)
     with pytest.raises(InputError, match="no model is called resnet; there are cnn_cls, cnn_reg"):
         find_model("resnet")
 
@@ -59,11 +61,27 @@ class Lonely:
     name = Options = estimate = stepper = "lonely"
 
 
+class OfWholeScans(Model):
+    """It lacks a stepper, and has a tracker of its own."""
+
+    name, uses_depth_vectors = "toy", False
+
+    @dataclass
+    class Options:
+        pass
+
+    def estimate(self, drive):
+        return estimate_by_tracking(self.tracker(), drive.raw_scans())
+
+    def tracker(self):
+        return "a tracker"
+
+
 @pytest.mark.parametrize(
     ("model", "message"),
     [
         (WithoutLoss, "model toy: lacks loss; "),
-        (type("Bare", (Model,), {}), "model toy: lacks name, Options, estimate, stepper; "),
+        (type("Bare", (Model,), {}), "model toy: lacks name, Options, estimate, stepper or tracker; "),
         (Lonely, "model toy: is no subclass of Model; "),
         (find_model("cnn_reg"), "model toy: its class is named cnn_reg; "),
     ],
@@ -72,6 +90,32 @@ def test_a_class_that_lacks_a_part_is_refused_in_one_line(model, message):
     with pytest.raises(InputError, match=message) as refused:
         check_model("toy", model)
     assert "\n" not in str(refused.value)
+
+
+def test_a_model_of_whole_scans_needs_no_stepper():
+    check_model("toy", OfWholeScans)
+    toy = OfWholeScans({}, SENSOR)
+    assert toy.tracker() == "a tracker"
+    with pytest.raises(NotImplementedError, match="toy looks at whole scans"):
+        toy.stepper()
+
+
+@pytest.mark.parametrize("variant", NAMES)
+def test_a_network_comes_through_a_stream_of_whole_scans(variant):
+    model, scans = build(variant), random_scans(8)
+    assert model.uses_depth_vectors
+    whole = model.estimate(drive_of(scans))
+    rows = [Scan(scan.astype(float), ANGLES, stamp=0.1 * n) for n, scan in enumerate(scans)]
+    streamed = estimate_by_tracking(model.tracker(), rows)
+    np.testing.assert_allclose(streamed.values, whole.values, atol=1e-5)
+    np.testing.assert_allclose(streamed.covariances, whole.covariances, rtol=1e-4, atol=1e-6)
+
+
+def test_the_contract_is_known_without_pytorch():
+    names = "contract, pairs, streaming, tracking"
+    heavy = "{'torch', 'numba', 'scipy'} & sys.modules.keys()"
+    code = f"import sys; from rcnn_odom.models import {names}; assert not {heavy}, {heavy}"
+    subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
 
 
 # --- options -------------------------------------------------------------------------------------

@@ -20,11 +20,12 @@ from data.make_carmen import PACKINGS, make_carmen, write_log
 from data.make_kitti import make_kitti, make_kitti_raw
 from data.point_orders import PERMUTED, RINGED, THINNED
 from odometry import ANGLES
-from rcnn_odom.deployment.odometer import LONGEST_HOLD, Odometer
+from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import Step
 from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.models.pairs import LONGEST_HOLD, PairTracker
 from rcnn_odom.recordings import carmen, json_lines, kitti, kitti_raw, rosbag
 from rcnn_odom.recordings.beams import BeamCheck, find_beams
 from rcnn_odom.recordings.formats import open_stream
@@ -490,7 +491,7 @@ class Straight:
 def test_no_clock_makes_the_odometer_run_away(data, moves):
     """Whatever the stamps and frames: no error, ten held metres a gap at most, none over a set clock."""
     CASES["clocks"] += 1
-    odometer, stamp, before = Odometer(Straight()), 1.0, 0.0
+    odometer, stamp, before = Odometer(PairTracker(Straight())), 1.0, 0.0
     for move in moves:
         kind, value = move or ("none", 0.0)
         stamp = stamp + value if kind == "after" else value if kind == "at" else stamp
@@ -720,7 +721,7 @@ def test_mutations_through_every_reader(logs_folder, data, kind, mutation, defin
     path = write_mutated(logs_folder, kind, scans, (first, step), stamps.tolist(), definition)
     stream = try_all("mutated recordings opened", open_stream, path)
     assert stream is not None
-    odometer, poses = Odometer(Straight()), []
+    odometer, poses = Odometer(PairTracker(Straight())), []
     try:
         for scan in stream.scans:
             poses.append(odometer.step(scan if stream.has_clock else replace(scan, stamp=None)))

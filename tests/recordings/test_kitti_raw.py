@@ -115,6 +115,32 @@ def test_the_clock_keeps_its_microseconds(root: Path) -> None:
     assert load(root).read_scan(2).stamp == stamps[2]
 
 
+def test_the_laser_turns_clockwise_about_the_moment_when_it_looks_ahead(root: Path) -> None:
+    """A turn begins and ends behind the car; on its left the laser looks before it looks ahead."""
+    scan = load(root).read_scan(0)
+    ahead, left = np.argmin(np.abs(scan.bearings)), np.argmin(np.abs(scan.bearings - np.pi / 2))
+    assert scan.times[ahead] == pytest.approx(0, abs=1e-3)
+    assert scan.times[left] == pytest.approx(-0.025, abs=1e-3)
+    np.testing.assert_allclose(scan.times, -0.1 * scan.bearings / (2 * np.pi))
+    assert not load(root).is_compensated
+    assert not kitti_raw.stream(drive_in(root)).is_compensated
+
+
+def test_the_time_of_a_turn_is_that_of_its_ends(root: Path) -> None:
+    turns = [0.1036, 0.0998, 0.1, 60.0, 0.0, -0.1]
+    ends = {"start": [20 + frame for frame in range(6)]}
+    ends["end"] = [start + turn for start, turn in zip(ends["start"], turns, strict=True)]
+    for end, seconds in ends.items():
+        lines = "".join(f"2011-09-26 13:{int(s // 60):02d}:{s % 60:012.9f}\n" for s in seconds)
+        (drive_in(root) / "velodyne_points" / f"timestamps_{end}.txt").write_text(lines)
+    recording, stream = load(root), kitti_raw.stream(drive_in(root))
+    for scan, turn in zip(stream.scans, [*turns[:3], 0.1, 0.1, 0.1], strict=True):
+        np.testing.assert_allclose(scan.times, -turn * scan.bearings / (2 * np.pi), atol=1e-6)
+    np.testing.assert_array_equal(
+        recording.read_scan(0).times, next(iter(kitti_raw.stream(drive_in(root)).scans)).times
+    )
+
+
 def test_text_gives_the_same_scans(root: Path) -> None:
     wanted = [beams(load(root).read_scan(frame)) for frame in range(6)]
     for frame in range(6):

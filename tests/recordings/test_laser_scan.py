@@ -88,6 +88,37 @@ def test_times_of_beams(increment, times):
 
 
 @pytest.mark.parametrize(
+    ("scan_time", "degrees", "last"),
+    [
+        (0.1, 360.0, 0.1 * 359 / 360),
+        (0.1, 180.0, 0.1 / 2 * 359 / 360),  # the other half of the turn is not seen
+        (0.025, -270.0, 0.025 * 0.75 * 359 / 360),  # clockwise, beam after beam all the same
+        (10.0, 360.0, 10 * 359 / 360),
+        (10.1, 360.0, None),
+        (0.0, 360.0, None),
+        (-0.1, 360.0, None),
+        (NAN, 360.0, None),
+        (INF, 360.0, None),
+    ],
+)
+def test_times_by_the_time_of_a_turn(scan_time, degrees, last):
+    spacing = np.deg2rad(degrees) / 360
+    scan = from_laser_scan(np.ones(360), 0.0, spacing, scan_time=scan_time)
+    if last is None:
+        assert scan.times is None
+    else:
+        np.testing.assert_allclose(scan.times, np.linspace(0, last, 360))
+    told = from_laser_scan(np.ones(360), 0.0, spacing, time_increment=1e-4, scan_time=scan_time)
+    np.testing.assert_allclose(told.times, 1e-4 * np.arange(360), err_msg="the increment counts")
+
+
+def test_times_that_cannot_be_are_unknown():
+    assert from_laser_scan(np.ones(360), 0.0, 0.01, time_increment=0.1).times is None  # 36 s
+    assert from_laser_scan([], 0.0, 0.01, time_increment=0.1).times.shape == (0,)
+    assert from_laser_scan([1.0], 0.0, 0.0, scan_time=0.1).times is None
+
+
+@pytest.mark.parametrize(
     ("angles", "count", "told"),
     [
         ((-1.5708, 0.0174533, 1.5708), 181, ""),

@@ -11,8 +11,10 @@ from conftest import SHARED
 from data.make_carmen import make_carmen
 from data.make_kitti import LEVEL_RING, make_kitti
 from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import planar_to_poses
 from rcnn_odom.recordings import carmen, kitti
 from rcnn_odom.recordings.formats import open_stream
+from rcnn_odom.recordings.stream import thin
 from scans import beams
 
 RANGES = np.random.default_rng(0).uniform(1, 39, (12, 181))
@@ -36,7 +38,10 @@ def test_a_kitti_folder_needs_no_poses(tmp_path):
         angles, ranges = beams(sequence.read_scan(frame))
         np.testing.assert_array_equal(scan.ranges, ranges)
         np.testing.assert_array_equal(scan.bearings, angles)
+        np.testing.assert_array_equal(scan.times, sequence.read_scan(frame).times)
         assert not scan.has_all_beams
+    assert stream.is_compensated
+    assert sequence.is_compensated
     assert f"ring {LEVEL_RING}" in stream.notes[1]
     _, others = read(tmp_path / "sequences" / "05", ring=0)
     assert not np.array_equal(others[0].ranges, scans[0].ranges)
@@ -62,6 +67,23 @@ def test_a_carmen_log_gives_the_scans_of_its_sequence(tmp_path, fmt, compress):
         np.testing.assert_array_equal(scan.bearings, angles)
         np.testing.assert_array_equal(scan.ranges, ranges)
         assert scan.stamp == sequence.stamps[frame]
+        assert scan.wheel_pose == sequence.read_scan(frame).wheel_pose
+        [wheels] = planar_to_poses([scan.wheel_pose])
+        np.testing.assert_allclose(wheels, sequence.wheel_odometry[frame], atol=1e-9)
+    assert not sequence.has_clock
+    assert not sequence.is_compensated
+
+
+@pytest.mark.parametrize(("every", "frames"), [(1, range(8)), (3, [0, 3, 6]), (7, [0, 7]), (50, [0])])
+def test_every_so_many_scans_of_a_stream(tmp_path, every, frames):
+    make_kitti(tmp_path, ["05"], frames=8)
+    scans = read(tmp_path / "sequences" / "05")[1]
+    thinned = thin(open_stream(tmp_path / "sequences" / "05"), every)
+    assert thinned.total == len(frames)
+    assert [scan.stamp for scan in thinned.scans] == [scans[frame].stamp for frame in frames]
+    make_carmen(tmp_path, "robot", frames=8)
+    unknown = thin(open_stream(tmp_path / "robot.log"), every)
+    assert (unknown.total, len(list(unknown.scans)), unknown.has_clock) == (None, len(frames), False)
 
 
 def test_broken_lines_of_a_log_are_skipped_and_counted(tmp_path, caplog):

@@ -152,3 +152,17 @@ def test_stamps_are_those_of_the_robots_laser():
         periods.append(np.median(interval))
     assert 1 / 12.5 < min(periods) < 1 / 6
     assert 1 / 4 < max(periods) < 1 / 1.8
+
+
+def test_people_walk_as_fast_whatever_the_laser_scans() -> None:
+    """Metres that legs move in a frame: half as many at twice the rate, the same at the usual one."""
+    building = plan_building(np.random.default_rng(3))
+    planar, _ = random_walk(building, 100, np.random.default_rng(3))
+    planar = planar[:1].repeat(100, axis=0)
+    moved = {}
+    for rate in (None, 4.0, 8.0):
+        scene = populate(building, planar, np.random.default_rng(5), True, rate)
+        legs = scene.moving.ends[:, :2].reshape(100, -1, 12, 2).mean(axis=2)
+        moved[rate] = np.median(np.hypot(*np.moveaxis(np.diff(legs, axis=0), -1, 0)))
+    assert moved[None] == moved[4.0] > 0
+    assert moved[8.0] == pytest.approx(moved[4.0] / 2, rel=0.2)

@@ -29,25 +29,28 @@ def test_all_ways_are_measured_and_compared(monkeypatch, capsys):
         "onnx fp32",
         "onnx int8",
         "rcnn_small",
-        "icp",
+        "matcher",
         "around the network",
+        *bench.PEERS,
     ):
-        assert f"\n{row} " in printed
+        assert f"\n{row} " in printed or f"{row} is left out: " in printed
 
 
 def test_ratios_are_those_of_the_medians():
     times = {"read fp32 weights": 9.0, "read int8 weights": 2.0, "convolutions": 1.0, "eager nn.LSTM": 150.0}
     times |= {"onnx fp32": 13.0, "onnx int8": 4.5, "rcnn_small": 0.9}
-    times |= {"around the network": 0.1, "icp": 4.5}
+    times |= {"around the network": 0.1, "matcher": 0.9, "kiss_icp": 1.8}
     ways = {name: Way(lambda frame: None, times=[value, value, 50.0]) for name, value in times.items()}
     rows = {
-        line[:25].strip(): line[25:].split()[0]
+        line[:30].strip(): line[30:].split()[0]
         for line in bench.report(ways, bench.build(RCNNRegression)).splitlines()
         if "=" in line
     }
     assert float(rows["eager / onnx int8"]) == pytest.approx(33.3)
     assert float(rows["onnx int8 / its floor"]) == 1.5
     assert float(rows["onnx fp32 / fp32 floor"]) == 1.3
+    assert float(rows["matcher / kiss_icp"]) == 0.5
+    assert 0.9 < float(rows["matcher, 99th percentile, ms"]) <= 50
 
 
 def test_the_eager_network_is_the_same_network():

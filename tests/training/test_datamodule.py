@@ -211,11 +211,15 @@ def test_turned_and_mirrored_window_has_exact_labels():
 @pytest.mark.parametrize(
     ("text", "expected"),
     [
-        ("05", ("05", 0.0, 1.0)),
-        ("mit-killian[:0.85]", ("mit-killian", 0.0, 0.85)),
-        ("mit-killian[0.85:]", ("mit-killian", 0.85, 1.0)),
-        ("a b[0.25:0.5]", ("a b", 0.25, 0.5)),
-        ("x[:]", ("x", 0.0, 1.0)),
+        ("05", ("05", 0.0, 1.0, 1)),
+        ("mit-killian[:0.85]", ("mit-killian", 0.0, 0.85, 1)),
+        ("mit-killian[0.85:]", ("mit-killian", 0.85, 1.0, 1)),
+        ("a b[0.25:0.5]", ("a b", 0.25, 0.5, 1)),
+        ("x[:]", ("x", 0.0, 1.0, 1)),
+        ("x[::3]", ("x", 0.0, 1.0, 3)),
+        ("x[0.2:0.8:12]", ("x", 0.2, 0.8, 12)),
+        ("x[0.5::1]", ("x", 0.5, 1.0, 1)),
+        ("x[::]", ("x", 0.0, 1.0, 1)),
     ],
 )
 def test_part_is_named_by_fractions(text, expected):
@@ -228,6 +232,51 @@ def test_part_is_named_by_fractions(text, expected):
 def test_wrong_part_is_refused(text):
     with pytest.raises(InputError, match="sequence"):
         parse_part(text)
+
+
+@pytest.mark.parametrize("every", ["0", "-1", "1.5", "x", " 3", "1e2", "٣", "3" * 20])
+def test_a_stride_that_is_none_is_refused(every):
+    with pytest.raises(InputError, match="after the second colon comes a whole number from 1 on") as refusal:
+        parse_part(f"x[0.2:0.8:{every}]")
+    assert "\n" not in str(refusal.value)
+    with pytest.raises(InputError, match="a part is written"):
+        parse_part("x[::3:4]")
+
+
+def test_every_third_scan_is_a_drive_of_its_own():
+    whole = replace(numbered(41), wheel_odometry=numbered(41).poses)
+    whole = replace(whole, read_scan=lambda frame: Scan(np.full(3, float(frame)), stamp=frame))
+    for name, frames in (("x[::3]", range(0, 41, 3)), ("x[0.25:0.75:4]", range(10, 31, 4))):
+        part = cut({"x": whole}, name)
+        assert (part.name, len(part), part.frames) == (name, len(frames), frames)
+        np.testing.assert_array_equal(part.scans[:, 0], frames)
+        assert part.scans.base is whole.scans, "nothing is copied"
+        np.testing.assert_array_equal(part.stamps, frames)
+        np.testing.assert_array_equal(part.poses, whole.poses[list(frames)])
+        np.testing.assert_array_equal(part.wheel_odometry, part.poses)
+        assert [scan.ranges[0] for scan in part.raw_scans()] == list(frames)
+        np.testing.assert_allclose(part.steps[:, 0], [sum(range(f, f + frames.step)) for f in frames[:-1]])
+    again = cut({"x": whole}, "x[0.25:0.75:4]").part(1, 4)
+    assert [scan.stamp for scan in again.raw_scans()] == [14, 18, 22]
+
+
+def test_unknown_truth_of_every_third_scan():
+    part = cut({"x": with_unknown(numbered(20), 0, 1, 2, 4, 19)}, "x[::3]")
+    assert part.scans[:, 0].tolist() == [3, 6, 9, 12, 15, 18]
+    with pytest.raises(InputError, match="frame 9, between"):
+        cut({"x": with_unknown(numbered(20), 9)}, "x[::3]")
+    with pytest.raises(InputError, match="1 frames with known poses"):
+        cut({"x": numbered(20)}, "x[::20]")
+
+
+def test_windows_of_every_third_scan():
+    drive = cut({"x": numbered(40)}, "x[0.25::3]")
+    batch = Windows([drive], FULL, 4).__getitems__([(2, 0, False)])
+    assert batch["pairs"][0, :, 0, 0].tolist() == [16, 19, 22, 25]
+    assert batch["pairs"][0, :, 1, 0].tolist() == [19, 22, 25, 28]
+    np.testing.assert_allclose(
+        batch["steps"][0, :, 0], [16 + 17 + 18, 19 + 20 + 21, 22 + 23 + 24, 25 + 26 + 27]
+    )
 
 
 def test_parts_do_not_overlap_and_leave_nothing_out():
@@ -292,6 +341,38 @@ def test_module_reads_encodes_and_cuts(cache):
     expected = np.stack([look(pose, FULL) for pose in planar])
     np.testing.assert_allclose(module.drives["train"][0].scans, expected, rtol=1e-5)
     np.testing.assert_allclose(module.drives["test"][0].scans, expected[20:], rtol=1e-5)
+
+
+def test_module_thins_what_it_encoded_once(cache):
+    module = room_module(cache, train=("long[::3]",), val=("long[0.5::2]",), test=("long",)).load()
+    whole = module.drives["test"][0].scans
+    np.testing.assert_array_equal(module.drives["train"][0].scans, whole[::3])
+    np.testing.assert_array_equal(module.drives["val"][0].scans, whole[20::2])
+    [item] = list(module.val_dataloader())
+    np.testing.assert_array_equal(item["scans"], whole[20::2])
+    with pytest.raises(InputError, match=r"data.train=long\[::3\]: new worlds come as whole drives"):
+        room_module(cache, train=("long[::3]",), fresh_epochs=2).load()
+
+
+def test_module_without_depth_vectors(tmp_path):
+    def open_other(name):
+        """A laser of which the sensor knows nothing, with nothing in sight at first."""
+        scans = [Scan(np.full(5, float(number)), np.full(5, 0.1), stamp=number) for number in range(9)]
+        return replace(open_room("long"), **parts(scans), has_clock=False, is_compensated=True)
+
+    def parts(scans):
+        poses, stamps = planar_to_poses(random_planar(9)), np.arange(9.0)
+        return {"poses": poses, "stamps": stamps, "read_scan": scans.__getitem__}
+
+    names = (["a"], ["a[0.5:]"], ["a", "a[::3]"])
+    module = OdometryDataModule(open_other, *names, FULL, tmp_path / "none", workers=1)
+    module.load(("test",), encode=False)
+    whole, third = module.drives["test"]
+    assert (whole.scans.shape, third.scans.shape, len(third)) == ((9, 0), (3, 0), 3)
+    assert (third.has_clock, third.is_compensated, third.name) == (False, True, "a[::3]")
+    assert [(scan.ranges[0], scan.stamp) for scan in third.raw_scans()] == [(0, None), (3, None), (6, None)]
+    assert third.steps.shape == (2, 3)
+    assert not (tmp_path / "none").exists(), "nothing is encoded"
 
 
 def test_a_recording_without_a_return_is_refused(tmp_path):

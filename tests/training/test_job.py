@@ -6,12 +6,14 @@ import signal
 from types import SimpleNamespace
 
 import pytest
+from hydra import compose, initialize_config_dir
 from hydra.errors import HydraException
 from omegaconf import OmegaConf
 from omegaconf.errors import InterpolationKeyError
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 from yaml import YAMLError
 
+from conftest import ROOT
 from rcnn_odom.errors import InputError
 from rcnn_odom.training import job, processes
 from rcnn_odom.training.saving import Stopped
@@ -47,6 +49,18 @@ def raising(error):
 def test_a_command_ends_with_a_status_and_a_line(capsys, error, status, line):
     assert job.run_command(raising(error)) == status
     assert capsys.readouterr().err == line
+
+
+def test_a_choice_of_an_earlier_version_is_answered(capsys):
+    """With Hydra's own complaint about a choice that is no longer there."""
+    with (
+        initialize_config_dir(str(ROOT / "conf"), version_base="1.3"),
+        pytest.raises(HydraException) as found,
+    ):
+        compose("evaluate", ["model=icpp"])
+    error = type(found.value)(str(found.value).replace("model/icpp", "model/icp"))
+    assert job.run_command(raising(error)) == 1
+    assert capsys.readouterr().err == "error: model=icp has become model=matcher; set that\n"
 
 
 def test_a_command_without_a_mistake_is_a_success():

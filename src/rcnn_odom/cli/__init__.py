@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from rcnn_odom import __version__
 from rcnn_odom.cli import drift, export, frames, relations, report, run, simulate
-from rcnn_odom.cli.arguments import join_heights
+from rcnn_odom.cli.arguments import join_signed
 from rcnn_odom.errors import InputError
 from rcnn_odom.training.terminal import show_any_text
 
@@ -25,7 +25,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         exits with 2.
     """
     show_any_text()
-    arguments = _build_parser().parse_args(join_heights(sys.argv[1:] if argv is None else argv))
+    arguments = _build_parser().parse_args(join_signed(sys.argv[1:] if argv is None else argv))
     try:
         status: int = arguments.run(arguments)
         sys.stdout.flush()

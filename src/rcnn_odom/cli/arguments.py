@@ -1,7 +1,11 @@
 """What the commands' arguments have in common."""
 
 import argparse
+import math
+import re
 from collections.abc import Callable, Sequence
+from itertools import takewhile
+from pathlib import Path
 from typing import TypeAlias
 
 Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
@@ -52,12 +56,48 @@ def degrees(text: str) -> float:
     return angle
 
 
-def join_heights(arguments: Sequence[str]) -> list[str]:
+def laser_pose(text: str) -> tuple[float, float, float]:
+    """Metres, metres and degrees as x, y and heading in radians, for ``type=`` of an argument."""
+    try:
+        x, y, heading = map(float, text.split())
+    except ValueError:
+        x = y = heading = math.nan
+    if not all(map(math.isfinite, (x, y, heading))):
+        raise argparse.ArgumentTypeError(
+            f"{text!r} is not three numbers, metres, metres and degrees: 0.2 0 -90"
+        )
+    return x, y, math.radians(heading)
+
+
+def split_thinning(text: str) -> tuple[Path, int | None]:
+    """The path and the 3 of ``PATH[::3]``; None of a path alone, and where there is a file of that name."""
+    match = re.fullmatch(r"(.+)\[::([1-9]\d*)\]", text)
+    if match is None or Path(text).exists():
+        return Path(text), None
+    return Path(match[1]), int(match[2])
+
+
+SIGNED = {"--height": 1, "--laser-pose": 3}
+"""Options whose values may begin with a minus, and how many values they have."""
+
+
+def join_signed(arguments: Sequence[str]) -> list[str]:
     """``--height -0.1:0.1`` as ``--height=-0.1:0.1``: argparse takes the former's value for an option."""
-    joined: list[str] = []
-    for argument in arguments:
-        if joined and joined[-1] == "--height":
-            joined[-1] += f"={argument}"
-        else:
-            joined.append(argument)
+    joined, rest = list[str](), list(arguments)
+    while rest:
+        joined.append(rest.pop(0))
+        values = rest[: SIGNED.get(joined[-1], 0)]
+        if joined[-1] == "--laser-pose":
+            values = list(takewhile(_is_number, values))
+        if values:
+            joined[-1] += f"={' '.join(values)}"
+            del rest[: len(values)]
     return joined
+
+
+def _is_number(text: str) -> bool:
+    try:
+        float(text)
+    except ValueError:
+        return False
+    return True

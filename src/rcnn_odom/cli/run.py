@@ -4,21 +4,39 @@ import argparse
 import io
 import json
 import logging
+import math
 import shlex
 import sys
 from collections.abc import Iterable
+from dataclasses import replace
+from itertools import chain, islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
-from rcnn_odom.cli.arguments import Subcommands, degrees, height, whole_number
+from rcnn_odom.cli.arguments import (
+    Subcommands,
+    degrees,
+    height,
+    laser_pose,
+    split_thinning,
+    whole_number,
+)
 from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
-    from rcnn_odom.deployment.odometer import Odometer, Pose
+    from rcnn_odom.deployment.odometer import Pose
+    from rcnn_odom.models.contract import ScanTracker
+    from rcnn_odom.recordings.stream import ScanStream
 
-
-FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg")
+MATCHER = "matcher"
+FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg", "base", "odom_topic")
 """Options that are a format's own."""
+FILE_OPTIONS = (*FORMAT_OPTIONS[1:], "wheels")
+"""Those of recordings alone."""
+MATCHER_OPTIONS, NETWORK_OPTIONS = ("wheels", "odom_topic", "deskew"), ("threads",)
+"""Those that only scan matching has, and those that only a network has."""
+FIRST_SCANS = 100
+"""In which the wheels must have been heard of."""
 
 
 def add(commands: Subcommands) -> None:
@@ -26,7 +44,8 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "run",
         help="poses from a recording or a live laser",
-        description="Estimate the trajectory of a recording: a folder of a KITTI sequence or of a KITTI raw "
+        description="Estimate the trajectory of any 2D laser by scan matching, or with --model by a trained "
+        "network, from a recording: a folder of a KITTI sequence or of a KITTI raw "
         "drive, a CARMEN log, a ROS bag with LaserScan or PointCloud2 messages (ROS 1, ROS 2 sqlite3 or "
         "mcap; no ROS needed), or a file of JSON lines; packed ones too. Writes trajectory.txt "
         "(KITTI), trajectory.tum, steps.jsonl (each step with its uncertainty), map.png and summary.json. "
@@ -35,15 +54,42 @@ def add(commands: Subcommands) -> None:
         "for each on standard output.",
     )
     add = parser.add_argument
-    add(
-        "paths",
-        nargs="*",
-        metavar="MODEL INPUT",
-        help="the model, unless --model names it, and the recording",
-    )
-    add("--model", metavar="MODEL", help="an exported .onnx, a .ckpt, or rcnn_small, which ships along")
-    add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
+    add("paths", nargs="*", metavar="INPUT", help="the recording; INPUT[::3] takes every third scan of it")
     add("--out", type=Path, metavar="DIR", help="folder to write to; must not hold a trajectory yet")
+    add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
+    add(
+        "--model",
+        metavar="MODEL",
+        help="matcher (scan matching, the default), an exported .onnx, a .ckpt, or rcnn_small, which ships "
+        "along",
+    )
+    add("--every", type=whole_number(1), metavar="N", help="take every N-th scan only")
+    _add_poses_and_priors(parser)
+    _add_format_options(parser)
+    add("--threads", type=whole_number(1), metavar="N", help="of a network's computation (1)")
+    parser.set_defaults(run=lambda arguments: _run(parser, arguments))
+
+
+def _add_poses_and_priors(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--laser-pose",
+        type=laser_pose,
+        metavar="X Y HEADING",
+        help="where the laser sits on the robot, in metres, metres and degrees: gives the robot's poses",
+    )
+    add("--base", metavar="FRAME", help="the robot's frame, base_link: its poses, by a bag's /tf_static")
+    add("--wheels", action="store_true", help="the odometry in a log helps the matcher")
+    add("--odom-topic", metavar="TOPIC", help="the odometry of this topic of a bag helps the matcher")
+    add(
+        "--deskew",
+        choices=("auto", "on", "off"),
+        help="take the motion within a scan out of it (auto: on unless the recording has done it)",
+    )
+
+
+def _add_format_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     add("--topic", help="of the messages in a bag, or in JSON lines of rosbridge, that has several")
     add("--ring", type=whole_number(0), metavar="N", help="of KITTI or a point cloud (the most level one)")
     add("--height", type=height, metavar="LOW:HIGH", help="metres: cuts a slice of a point cloud, not a ring")
@@ -53,40 +99,122 @@ def add(commands: Subcommands) -> None:
         metavar="DEG",
         help="that the beams of a CARMEN log's FLASER lines cover (what the log says, or 180)",
     )
-    add("--threads", type=whole_number(1), default=1, metavar="N", help="of the computation (%(default)s)")
-    parser.set_defaults(run=lambda arguments: _run(parser, arguments))
 
 
 def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    paths = [arguments.model, *arguments.paths] if arguments.model else arguments.paths
-    if len(paths) != (1 if arguments.live else 2):
-        parser.error("give MODEL and either INPUT or --live")
-    if not arguments.live and arguments.out is None:
-        parser.error("--out DIR is needed")
-    of_files = [name for name in FORMAT_OPTIONS if name != "topic" and getattr(arguments, name) is not None]
-    if arguments.live and of_files:
-        parser.error(f"--{of_files[0].replace('_', '-')} is of recordings, not of --live")
-
+    _check(parser, arguments)
+    from rcnn_odom.deployment.odometer import Odometer
     from rcnn_odom.deployment.run import format_summary, run
-    from rcnn_odom.recordings import json_lines
-    from rcnn_odom.recordings.formats import open_stream
 
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
-    odometer, model = _load(paths[0], arguments.threads), Path(paths[0]).stem
+    model = arguments.model or MATCHER
+    network = None if model == MATCHER else _load_network(model, arguments.threads or 1)
+    stream = _open(parser, arguments)
+    odometer = Odometer(
+        network or _build_matcher(arguments, stream), arguments.laser_pose or stream.laser_pose
+    )
     if arguments.live:
-        lines = _read_live()
-        summary = run(
-            odometer, json_lines.stream_lines(lines, topic=arguments.topic), model, arguments.out, _print_pose
-        )
+        summary = run(odometer, stream, Path(model).stem, arguments.out, _print_pose)
         print(format_summary(summary), file=sys.stderr)
         return 0
-    options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
-    stream = open_stream(Path(paths[1]), options)
     for note in stream.notes:
         print(f"{stream.name}: {note}")
-    print(format_summary(run(odometer, stream, model, arguments.out)))
+    print(format_summary(run(odometer, stream, Path(model).stem, arguments.out)))
     print(f"all of it is in {shlex.quote(str(arguments.out))}")
     return 0
+
+
+def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Refuses what does not go together.
+
+    Raises:
+        InputError: the model comes before the recording, as it did in earlier versions.
+    """
+    _refuse_old_order(arguments)
+    if len(arguments.paths) != (0 if arguments.live else 1):
+        parser.error("give one INPUT or --live")
+    if not arguments.live and arguments.out is None:
+        parser.error("--out DIR is needed")
+    if arguments.base and arguments.laser_pose:
+        parser.error("--base and --laser-pose say the same; give one of them")
+    if arguments.wheels and arguments.odom_topic:
+        parser.error("--wheels and --odom-topic are two odometries; give one of them")
+    is_matcher = arguments.model in (None, MATCHER)
+    for names, is_refused, why in (
+        (FILE_OPTIONS, arguments.live, "is of recordings, not of --live"),
+        (MATCHER_OPTIONS, not is_matcher, "is of the matcher, not of a network"),
+        (NETWORK_OPTIONS, is_matcher, "is of a network (--model), not of the matcher"),
+    ):
+        for name in names:
+            if is_refused and getattr(arguments, name) not in (None, False):
+                parser.error(f"{_option(name)} {why}")
+
+
+def _refuse_old_order(arguments: argparse.Namespace) -> None:
+    """Answers ``run MODEL INPUT`` and ``run MODEL --live`` with what they have become."""
+    paths = arguments.paths
+    if arguments.model or len(paths) != (1 if arguments.live else 2):
+        return
+    from rcnn_odom.deployment.shipped import shipped_models
+
+    model = paths[0]
+    if not (model.endswith((".onnx", ".ckpt")) or model in (MATCHER, *shipped_models())):
+        return
+    words = ["rcnn-odom", "run", *paths[1:], "--model", model]
+    for name, value in vars(arguments).items():
+        if name not in ("paths", "model", "run") and value not in (None, False):
+            words += [_option(name), *_as_words(name, value)]
+    raise InputError(f"the recording comes first, and the model is an option: {shlex.join(words)}")
+
+
+def _option(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _as_words(name: str, value: Any) -> list[str]:
+    """An option's value as it is written on the command line."""
+    if name == "laser_pose":
+        x, y, heading = value
+        return [f"{x:g}", f"{y:g}", f"{math.degrees(heading):g}"]
+    if name == "height":
+        return [":".join(f"{each:g}" for each in value)]
+    return [] if value is True else [str(value)]
+
+
+def _open(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> "ScanStream":
+    """The scans that are asked for.
+
+    Raises:
+        InputError: there is no such recording, or it lacks what an option asks for.
+    """
+    from rcnn_odom.recordings import json_lines
+    from rcnn_odom.recordings.formats import open_stream
+    from rcnn_odom.recordings.stream import thin
+
+    if arguments.live:
+        return thin(json_lines.stream_lines(_read_live(), topic=arguments.topic), arguments.every or 1)
+    path, every = split_thinning(arguments.paths[0])
+    if every and arguments.every:
+        parser.error(f"--every and [::{every}] say the same; give one of them")
+    options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
+    if arguments.odom_topic:
+        options["laser_pose"] = arguments.laser_pose  # by which the odometry is carried over to the laser
+    stream = open_stream(path, options)
+    if arguments.wheels or arguments.odom_topic:
+        stream = _need_wheels(stream, "--wheels" if arguments.wheels else "--odom-topic")
+    return thin(stream, every or arguments.every or 1)
+
+
+def _need_wheels(stream: "ScanStream", option: str) -> "ScanStream":
+    """The same stream, after a look whether its first scans come with the robot's own odometry.
+
+    Raises:
+        InputError: they do not.
+    """
+    first = list(islice(stream.scans, FIRST_SCANS))
+    if first and not any(scan.wheel_pose for scan in first):
+        raise InputError(f"{stream.name}: has no odometry of the robot with its scans; leave {option} out")
+    return replace(stream, scans=chain(first, stream.scans))
 
 
 def _read_live() -> Iterable[str]:
@@ -107,11 +235,18 @@ def _print_pose(pose: "Pose") -> None:
     print(json.dumps(pose.as_dict()), flush=True)
 
 
-def _load(model: str, threads: int) -> "Odometer":
+def _build_matcher(arguments: argparse.Namespace, stream: "ScanStream") -> "ScanTracker":
+    from rcnn_odom.models.matcher import MatcherTracker
+
+    deskew = {"on": True, "off": False}.get(arguments.deskew, not stream.is_compensated)
+    return MatcherTracker(wheels=bool(arguments.wheels or arguments.odom_topic), deskew=deskew)
+
+
+def _load_network(model: str, threads: int) -> "ScanTracker":
     if model.endswith(".ckpt"):
         from rcnn_odom.training.export import load_odometer
 
-        return load_odometer(Path(model), threads)
+        return load_odometer(Path(model), threads).tracker
     from rcnn_odom.deployment.odometer import Odometer
 
-    return Odometer.from_onnx(model, threads=threads)
+    return Odometer.from_onnx(model, threads=threads).tracker

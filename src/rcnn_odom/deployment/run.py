@@ -1,4 +1,4 @@
-"""A trained network over a recording or a live laser: ``rcnn-odom run``."""
+"""A model over a recording or a live laser: ``rcnn-odom run``."""
 
 import json
 import math
@@ -14,10 +14,11 @@ import numpy as np
 import numpy.typing as npt
 from tqdm import tqdm
 
-from rcnn_odom.deployment.odometer import PASSED_OVER, Odometer, Pose
+from rcnn_odom.deployment.odometer import Odometer, Pose
 from rcnn_odom.deployment.sampling import EvenSample
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import change_frame
+from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame
+from rcnn_odom.models.tracking import PASSED_OVER
 from rcnn_odom.recordings.beams import compare_beams
 from rcnn_odom.recordings.returns import AbsentReturns
 from rcnn_odom.recordings.scan import Scan
@@ -32,8 +33,10 @@ LATENCIES = 100_000
 FEW_SCANS = 6
 """Fewer than so many need not have two that can be compared."""
 ANOTHER_MODEL = (
-    "train a model on recordings of such a laser (python train.py data=... {}), or give another recording"
+    "take --model matcher, which fits any laser, or train a model on recordings of such a laser (python "
+    "train.py data=... {})"
 )
+GIVE_ANGLES = "give angle_min and angle_increment with its ranges, or points"
 
 Summary = dict[str, Any]
 
@@ -53,7 +56,7 @@ def run(
     Args:
         odometer: at its start.
         stream: the scans.
-        model: what to call the network.
+        model: what to call it.
         out: folder for trajectories, steps, map and summary; it must not hold a trajectory yet.
         on_pose: gets every pose as soon as it is known.
 
@@ -66,8 +69,10 @@ def run(
             breaks off.
     """
     statistics = Statistics(stream, model, odometer)
+    # Of a robot no camera is known; its trajectory is told as of one that looks ahead.
+    camera = FORWARD_CAMERA if odometer.laser_pose else stream.camera_from_laser
     with ExitStack() as stack:
-        folder = OutputFolder(out, stream, stack) if out else None
+        folder = OutputFolder(out, stream, camera, stack) if out else None
         bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
         try:
             for scan in stack.enter_context(closing(bar)):
@@ -91,22 +96,22 @@ class Statistics:
 
     Args:
         stream: the scans.
-        model: what to call the network.
+        model: what to call it.
         odometer: at its start.
 
     Attributes:
         can_use: there was a scan that fits the model and has returns.
 
     Raises:
-        InputError: the stream's laser is another than the model's.
+        InputError: the stream's laser is another than a network's.
     """
 
     def __init__(self, stream: ScanStream, model: str, odometer: Odometer) -> None:
         self.stream, self.model, self.odometer = stream, model, odometer
         self.scans, self.path, self.longest, self.stopped = 0, 0.0, 0.0, ""
-        self.can_use, sensor = False, odometer.description.sensor
-        self._absent = AbsentReturns(sensor.max_range)
-        if stream.beams and (reason := compare_beams(stream.beams, sensor)):
+        self.can_use, sensor = False, odometer.sensor
+        self._absent = AbsentReturns(sensor.max_range if sensor else math.inf)
+        if sensor and stream.beams and (reason := compare_beams(stream.beams, sensor)):
             advice = ANOTHER_MODEL.format(stream.beams.sensor_options() or "data.sensor...")
             raise InputError(f"{stream.name}: {reason}; {advice}")
         self.degraded: Counter[str] = Counter()
@@ -117,15 +122,17 @@ class Statistics:
         """One scan through the odometer, timed and counted.
 
         Raises:
-            InputError: the laser is another than the model's, for good.
+            InputError: the laser is another than a network's, for good; or nothing says where its beams lie.
         """
-        odometer = self.odometer
+        odometer, check = self.odometer, self.odometer.beam_check
+        if scan.bearings is None and not odometer.sensor:
+            raise InputError(f"{self.stream.name}: scan {self.scans + 1} has no angles; {GIVE_ANGLES}")
         start = time.perf_counter()
         pose = odometer.step(scan if self.stream.has_clock else replace(scan, stamp=None))
         milliseconds = 1e3 * (time.perf_counter() - start)
         self.scans += 1
-        if odometer.beam_check.is_for_good:
-            raise odometer.beam_check.refusal(f"{self.stream.name}: scan {self.scans}", ANOTHER_MODEL)
+        if check and check.is_for_good:
+            raise check.refusal(f"{self.stream.name}: scan {self.scans}", ANOTHER_MODEL)
         self.can_use = self.can_use or odometer.has_seen
         if not self.can_use:
             self._absent.add(scan)
@@ -149,8 +156,8 @@ class Statistics:
         if self.can_use:
             counts = ", ".join(f"{count} {kind}" for kind, count in self.degraded.most_common())
             raise InputError(f"{name}: no two of its {self.scans} scans can be compared ({counts}); {advice}")
-        if self.odometer.beam_check.reason:
-            raise self.odometer.beam_check.refusal(name, ANOTHER_MODEL)
+        if (check := self.odometer.beam_check) and check.reason:
+            raise check.refusal(name, ANOTHER_MODEL)
         if not self.scans:
             raise InputError(f"{name}: no scan in it; give another recording")
         raise InputError(f"{name}: {self._absent}; {advice}")
@@ -161,6 +168,7 @@ class Statistics:
         return {
             "input": self.stream.name,
             "model": self.model,
+            "laser_pose": self.odometer.laser_pose,
             "scans": self.scans,
             "path_m": self.path,
             "notes": list(self.stream.notes),
@@ -176,15 +184,16 @@ class OutputFolder:
 
     Args:
         folder: to write to, made where missing.
-        stream: the scans, for the frame of the trajectories.
+        stream: the scans, for their name.
+        camera: (4, 4) from the body whose poses are given, the frame in which trajectories are written.
         stack: closes the files of lines.
 
     Raises:
         InputError: the folder holds a trajectory already.
     """
 
-    def __init__(self, folder: Path, stream: ScanStream, stack: ExitStack) -> None:
-        self.folder, self.stream = folder, stream
+    def __init__(self, folder: Path, stream: ScanStream, camera: FloatArray, stack: ExitStack) -> None:
+        self.folder, self.stream, self.camera = folder, stream, camera
         self._stack, self._written = stack, 0
         self._made = [each for each in (folder, *folder.parents) if not each.exists()]
         if (folder / TRAJECTORY).exists():
@@ -211,7 +220,7 @@ class OutputFolder:
         """
         if not self._written:
             self._begin()
-        camera_pose = change_frame(pose.matrix()[None], self.stream.camera_from_laser)
+        camera_pose = change_frame(pose.matrix()[None], self.camera)
         write_kitti(self._kitti, camera_pose)
         if not pose.degraded.startswith(PASSED_OVER):
             write_tum(self._tum, [self._written if pose.stamp is None else pose.stamp], camera_pose)
@@ -248,6 +257,12 @@ def format_summary(summary: Summary) -> str:
     """Lines for people."""
     times = summary["latency"]
     lines = [f"{summary['input']}: {summary['scans']} scans, {summary['path_m']:.1f} m by {summary['model']}"]
+    if summary["laser_pose"]:
+        x, y, heading = summary["laser_pose"]
+        lines.append(
+            f"poses of the robot, with its laser {x:g} m ahead, {y:g} m to the left, turned by "
+            f"{math.degrees(heading):.4g} degrees"
+        )
     for title in ("degraded", "skipped"):
         if summary[title]:
             counts = ", ".join(f"{count} {kind}" for kind, count in summary[title].items())

@@ -2,12 +2,15 @@
 
 import sys
 import time
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.contract import ScanTracker, Stepper
+from rcnn_odom.models.tracking import Tracking
+from rcnn_odom.recordings.scan import Scan
 
 WARM_UP = 5
 """Frames before the clock starts: memory and caches find their places."""
@@ -27,23 +30,45 @@ def measure(stepper: Stepper, scans: npt.NDArray[np.float32]) -> dict[str, Any]:
     """
     scans = np.array(scans[: FRAMES + 1])
     pairs = [scans[frame : frame + 2] for frame in range(len(scans) - 1)]
+    return _measure(stepper, stepper.reset, pairs)
+
+
+def measure_tracker(tracker: ScanTracker, scans: Sequence[Scan]) -> dict[str, Any]:
+    """The same of a model of whole scans: the time from a scan as the laser gave it to a step.
+
+    Args:
+        tracker: estimates the steps.
+        scans: at least two.
+    """
+    tracking = Tracking(tracker)
+
+    def restart() -> None:
+        tracking.reset()
+        tracking.step(scans[0])
+
+    return _measure(tracking.step, restart, scans[1 : FRAMES + 1])
+
+
+def _measure(
+    step: Callable[[Any], object], restart: Callable[[], None], frames: Sequence[Any]
+) -> dict[str, Any]:
     torch = sys.modules.get("torch")  # A stepper that computes with it has imported it; others need it not.
     threads = torch.get_num_threads() if torch else 1
     try:
         if torch:
             torch.set_num_threads(1)
-        for warm in (pairs[:WARM_UP], pairs):
-            stepper.reset()
-            times = [_milliseconds(stepper, pair) for pair in warm]
+        for warm in (frames[:WARM_UP], frames):
+            restart()
+            times = [_milliseconds(step, frame) for frame in warm]
     finally:
         if torch:
             torch.set_num_threads(threads)
-    stepper.reset()
+    restart()
     median, p99 = np.percentile(times, [50, 99]).tolist()
-    return {"median_ms": median, "p99_ms": p99, "frames": len(pairs), "threads": 1}
+    return {"median_ms": median, "p99_ms": p99, "frames": len(frames), "threads": 1}
 
 
-def _milliseconds(stepper: Stepper, pair: npt.NDArray[np.float32]) -> float:
+def _milliseconds(step: Callable[[Any], object], frame: Any) -> float:
     start = time.perf_counter()
-    stepper(pair)
+    step(frame)
     return 1e3 * (time.perf_counter() - start)

@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from rcnn_odom.evaluation.figures import coverage_figure, motion_figure, trajectory_figure
-from rcnn_odom.evaluation.latency import measure
 from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import Settings
 from rcnn_odom.evaluation.scores import (
@@ -17,13 +16,13 @@ from rcnn_odom.evaluation.scores import (
     coverage_table,
     in_deviations,
     metrics_table,
+    path_ratio,
     percent,
     score_all,
     table,
 )
 from rcnn_odom.geometry import FloatArray, Steps, change_frame, motions_of, relative_steps
 from rcnn_odom.models.constant import ConstantStep, held_motion
-from rcnn_odom.models.contract import Stepper
 from rcnn_odom.models.two_numbers import Apply, restate, steps_of
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.trajectory import file_name, write_kitti, write_motions, write_tum
@@ -42,7 +41,7 @@ def report_drives(
     name: str,
     steps: Mapping[str, Steps],
     mean_step: FloatArray | None,
-    stepper: Stepper,
+    latency: Report,
     drives: list[Drive],
     data: Settings,
     folder: Path,
@@ -55,7 +54,7 @@ def report_drives(
         steps: what it makes of the drives, by their name.
         mean_step: (3,) of the training drives, which the baseline ``mean_motion`` repeats; None where it
             is not known.
-        stepper: the model frame by frame, to measure its time.
+        latency: the model's time, see :func:`rcnn_odom.evaluation.latency.measure`.
         drives: with their truth.
         data: the options of ``conf/data``.
         folder: gets ``trajectories`` and ``figures``.
@@ -63,9 +62,10 @@ def report_drives(
 
     Returns:
         ``test`` (see :func:`rcnn_odom.evaluation.scores.score_all`); ``baselines`` of the same form by name,
-        among them ``NAME_two_numbers`` where the steps say more than two numbers can; ``latency`` (see
-        :func:`rcnn_odom.evaluation.latency.measure`); ``versions`` of what computed them; and where
-        covariances are known ``coverage`` by drive (see :func:`rcnn_odom.evaluation.scores.coverage`).
+        among them ``NAME_two_numbers`` where the steps say more than two numbers can; ``latency``;
+        ``path_ratio``, by drive the length of the estimated path over that of the true one (None where that
+        stands still); ``versions`` of what computed them; and where covariances are known ``coverage`` by
+        drive (see :func:`rcnn_odom.evaluation.scores.coverage`).
     """
     baselines = baseline_steps(mean_step, drives)
     methods = {name: steps, **baselines, **_in_two_numbers(name, steps, data["apply"])}
@@ -74,7 +74,6 @@ def report_drives(
         for method, estimated in methods.items()
     }
     log.info("\n%s\n\n%s\n", table(reports), metrics_table(reports))
-    latency = measure(stepper, drives[0].scans)
     times = latency["median_ms"], latency["p99_ms"]
     log.info("%s: %.2f ms a frame, 99th percentile %.2f, on one thread", name, *times)
     test = reports.pop(name)
@@ -84,7 +83,14 @@ def report_drives(
         write_drive(drive, steps[drive.name], others, folder / "trajectories")
     _save_figures(_figures(name, steps, drives, data["name"], test), folder / "figures", add_figure)
     versions = {package: version(package) for package in PACKAGES}
-    report = {"test": test, "baselines": reports, "latency": latency, "versions": versions}
+    paths = {drive.name: path_ratio(steps[drive.name], drive) for drive in drives}
+    report = {
+        "test": test,
+        "baselines": reports,
+        "latency": latency,
+        "path_ratio": paths,
+        "versions": versions,
+    }
     if shares:
         log.info("%s\n", coverage_table(shares))
         report["coverage"] = shares

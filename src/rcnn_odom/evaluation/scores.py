@@ -140,6 +140,16 @@ def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply:
     return {**report, "path_m": path, "end_m": end, "end_ratio": end / path if path else None}
 
 
+def path_ratio(steps: Steps, drive: Drive) -> float | None:
+    """Length of the estimated path over that of the true one: far below 1 where an estimate stands still.
+
+    Returns:
+        None where the truth stands still.
+    """
+    path, true_path = (float(np.hypot(*every[:, :2].T).sum()) for every in (steps.values, drive.steps))
+    return path / true_path if true_path else None
+
+
 def smooth(distances: FloatArray) -> FloatArray:
     """Distances (N,) without the jitter of a GPS: Savitzky-Golay, parabolas over ``SMOOTHING`` frames.
 

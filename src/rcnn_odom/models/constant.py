@@ -53,9 +53,5 @@ def mean_step(open_recording: OpenRecording, names: Sequence[str]) -> FloatArray
 
 
 def _without_scans(open_recording: OpenRecording, name: str) -> Drive:
-    recording = open_recording(parse_part(name)[0])
-    scans = np.empty((len(recording), 0), dtype=np.float32)
-    pose = recording.camera_from_laser
-    return cut(
-        {recording.name: Drive(recording.name, "", scans, recording.poses, recording.stamps, pose)}, name
-    )
+    recording = open_recording(parse_part(name).file)
+    return cut({recording.name: Drive.unencoded(recording)}, name)

@@ -5,97 +5,22 @@ A model is one file in this package and one in ``conf/model``; docs/extending.md
 
 import inspect
 from abc import ABC, abstractmethod
-from dataclasses import dataclass, fields, is_dataclass
-from typing import Any, ClassVar, Protocol
-
-import numpy as np
-import numpy.typing as npt
+from dataclasses import fields, is_dataclass
+from itertools import chain
+from typing import Any, ClassVar
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray, Step, Steps
+from rcnn_odom.geometry import Steps
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import PairTracker
+
+# Also what a model is made of in a stream, so that one import brings all of the contract.
+from rcnn_odom.models.streaming import Description as Description
+from rcnn_odom.models.streaming import Registered as Registered
+from rcnn_odom.models.streaming import ScanTracker as ScanTracker
+from rcnn_odom.models.streaming import Stepper as Stepper
 from rcnn_odom.recordings.recording import Drive
-from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.registry import choose, collect, modules_in
-
-
-@dataclass(frozen=True)
-class Description:
-    """What an odometer has to know of its model.
-
-    Attributes:
-        sensor: the laser as the model sees it: how scans are encoded for it.
-        typical_step: root mean square of the training steps' x, y (metres) and heading (radians): how wrong
-            a step may be that is not known at all. nan if unknown.
-        least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
-        period: usual seconds between scans in training; nan if unknown.
-    """
-
-    sensor: Sensor
-    typical_step: tuple[float, float, float] = (np.nan, np.nan, np.nan)
-    least_filled: float = np.nan
-    period: float = np.nan
-
-
-class Stepper(Protocol):
-    """A model in a stream: it estimates one step after the other and carries its own state."""
-
-    description: Description
-
-    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
-        """The step between two encoded scans (2, bins), the earlier first."""
-
-    def reset(self) -> None:
-        """Forgets all earlier pairs."""
-
-
-@dataclass(frozen=True, eq=False)
-class Registered:
-    """What a model in a stream makes of one more scan.
-
-    Attributes:
-        step: from the scan before. Where nothing could be estimated, the last motion, with a covariance that
-            says how wrong that may be.
-        notes: what the step suffers from, each with its kind before a colon; empty: nothing.
-        is_estimated: the step comes from this scan, at least in part; otherwise the last motion went on.
-    """
-
-    step: Step
-    notes: tuple[str, ...] = ()
-    is_estimated: bool = True
-
-
-class ScanTracker(Protocol):
-    """A model in a stream of whole scans: it keeps what it needs of those before."""
-
-    period: float
-    """Usual seconds between scans in training; nan: any."""
-
-    def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
-        """The step to one more scan.
-
-        Args:
-            scan: as the laser gave it.
-            periods: usual times between scans since the last one, more than 1 over a gap.
-            seconds: since the last one; None: unknown.
-        """
-
-    def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes a scan that cannot be compared with those before: the first, or after a clock was set.
-
-        Returns:
-            Notes as in :class:`Registered`.
-        """
-
-    def reset(self) -> None:
-        """Forgets everything: the next scan is the first of another laser or of another place of it."""
-
-    @property
-    def has_seen(self) -> bool:
-        """Whether there is a scan with returns that the next one can be compared with."""
-
-    def returns(self) -> FloatArray:
-        """Points (P, 2) in metres of the last scan in the laser's frame; empty where it was not used."""
 
 
 class Model(ABC):
@@ -110,11 +35,17 @@ class Model(ABC):
         Options: a dataclass of its options; see :mod:`rcnn_odom.options` for bounds.
         trains: whether ``train.py`` has something to do; then it is a
             :class:`rcnn_odom.models.trained.TrainedModel`.
+        uses_depth_vectors: whether it looks at ``Drive.scans``, which are not made for it otherwise.
+        deskew: ``data.deskew``, for a model of whole scans: whether it takes the motion of the laser within a
+            scan out of it, ``on`` or ``off``; ``auto``: unless ``Drive.is_compensated``.
+        deskew: whether a model of whole scans undistorts them: ``on``, ``off`` or, by the drive, ``auto``.
     """
 
     name: ClassVar[str]
     Options: ClassVar[type]
     trains: ClassVar[bool] = False
+    uses_depth_vectors: ClassVar[bool] = True
+    deskew: str = "auto"
     sensor: Sensor
 
     def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
@@ -125,12 +56,18 @@ class Model(ABC):
     def estimate(self, drive: Drive) -> Steps:
         """The steps of one whole drive."""
 
-    @abstractmethod
     def stepper(self) -> Stepper:
-        """The same one pair of scans after the other."""
+        """The same one pair of encoded scans after the other; a model that looks at whole scans has none."""
+        raise NotImplementedError(f"{self.name} looks at whole scans; it has a tracker")
+
+    def tracker(self) -> ScanTracker:
+        """The same one scan after the other; a model that looks at whole scans has one of its own."""
+        return PairTracker(self.stepper())
 
 
-NEEDED = ("name", "Options", "estimate", "stepper")
+NEEDED = ("name", "Options", "estimate")
+NEEDED_IN_A_STREAM = ("stepper", "tracker")
+"""One of them is needed."""
 NEEDED_TO_TRAIN = ("forward", "loss")
 RECIPE = {"epochs", "learning_rate", "window", "batch_size"}
 """Options of every training, see :class:`rcnn_odom.models.trained.Recipe`."""
@@ -146,6 +83,8 @@ def check_model(name: str, model: Any) -> None:
     needed = NEEDED + (NEEDED_TO_TRAIN if trains else ())
     abstract = getattr(model, "__abstractmethods__", ())
     missing = [part for part in needed if not hasattr(model, part) or part in abstract]
+    if not any(getattr(model, each, None) not in (None, getattr(Model, each)) for each in NEEDED_IN_A_STREAM):
+        missing.append(" or ".join(NEEDED_IN_A_STREAM))
     if not missing and is_dataclass(model.Options) and trains:
         given = {each.name for each in fields(model.Options)}
         wanted = RECIPE | ({"first_stage", "pretrained"} if model.first_stage else set())
@@ -175,7 +114,7 @@ def all_models(only: str | None = None) -> dict[str, type[Model]]:
         InputError: two have the same name, or one lacks a part.
     """
     built_in: dict[str, type[Model]] = {}
-    for module in modules_in("rcnn_odom.models"):
+    for module in chain(modules_in("rcnn_odom.models"), modules_in("rcnn_odom.models.peers")):
         for member in vars(module).values():
             is_model = inspect.isclass(member) and issubclass(member, Model)
             if is_model and member.__module__ == module.__name__ and "name" in vars(member):

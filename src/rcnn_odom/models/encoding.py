@@ -56,11 +56,14 @@ class Sensor:
 
         Beams without bearings are spread evenly over the field of view.
         """
-        bearings = scan.bearings
-        if bearings is None:
-            low, high = np.deg2rad([self.first_bin_deg, self.first_bin_deg + self.field_of_view_deg]).tolist()
-            bearings = np.linspace(low, high, len(scan.ranges), endpoint=self.field_of_view_deg != 360)
-        return encode(bearings, scan.ranges, self)
+        return encode(self.bearings_of(scan), scan.ranges, self)
+
+    def bearings_of(self, scan: Scan) -> npt.NDArray[np.float64]:
+        """Bearings (P,) of a scan's beams in radians, spread evenly over the field of view where unknown."""
+        if scan.bearings is not None:
+            return scan.bearings
+        low, high = np.deg2rad([self.first_bin_deg, self.first_bin_deg + self.field_of_view_deg]).tolist()
+        return np.linspace(low, high, len(scan.ranges), endpoint=self.field_of_view_deg != 360)
 
     def as_dict(self) -> dict[str, Any]:
         """Plain numbers, for checkpoints and cache keys; those of a laser that looks ahead as ever."""

@@ -1,28 +1,63 @@
-"""Scan matching (stub that holds still; the algorithm follows)."""
+"""Odometry by scan matching, for any 2D laser, without training."""
 
+import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import numpy as np
 
-from rcnn_odom.geometry import FloatArray, Step, Steps
-from rcnn_odom.models.contract import Model, Registered
+from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_step
+from rcnn_odom.matching.deskew import deskew
+from rcnn_odom.matching.no_return import NoReturn
+from rcnn_odom.matching.outline import Outline, find_points, outline
+from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
+from rcnn_odom.models.contract import Model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.streaming import Registered
+from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
+
+FARTHEST = 120.0
+"""Metres from which on a reading is no return."""
+LONGEST_HOLD = 10.0
+"""Periods over which the last motion goes on; for longer it is not known to."""
+GUESS_DISTANCE, GUESS_TURN = 0.1, 0.1
+"""Metres and radians a period by which the last motion is off as a guess, and beside them half of itself."""
+WHEELS_DISTANCE, WHEELS_TURN = 0.01, 0.01
+"""The same of wheel odometry, beside a tenth of itself."""
+SLIP = 0.1
 
 
 @dataclass(frozen=True)
 class MatcherOptions:
-    """What ``conf/model/matcher.yaml`` sets."""
+    """What ``conf/model/matcher.yaml`` sets.
+
+    Attributes:
+        wheels: the robot's own odometry, where a scan has it, is the guess of a match and pulls it.
+    """
 
     wheels: bool = False
 
 
 class MatcherTracker:
-    """Registers each scan against a map of those before."""
+    """Registers each scan against a map of what the laser has seen lately.
 
-    period = float("nan")
+    Notes are of these kinds:
+
+    - *no returns*, or fewer than 15 points on anything straight (*few returns*): the last motion goes on.
+    - *no match*: the scan does not fit the map; the last motion goes on. After several in a row a new map
+      begins (*new map*).
+    - *held*: what is seen does not determine the motion along a direction; along it the last motion goes on.
+    - *poor match*: much of the scan does not fit the map; the estimate stands.
+    - *ambiguous*: the scan fits the map in two places; the better one is taken.
+
+    Args:
+        wheels: as in :class:`MatcherOptions`.
+        deskew: scans whose beams have times are undistorted by the current motion.
+    """
+
+    period = math.nan
 
     def __init__(self, wheels: bool = False, deskew: bool = True) -> None:
         self.wheels, self.deskew = wheels, deskew
@@ -30,21 +65,123 @@ class MatcherTracker:
 
     def reset(self) -> None:
         """Forgets everything."""
-        self._points: FloatArray = np.empty((0, 2))
-        self.has_seen = False
+        self._registration, self._no_return = Registration(), NoReturn()
+        self._motion, self._seconds, self._held = np.zeros(3), math.nan, 0.0
+        self._wheel_pose: tuple[float, float, float] | None = None
+        self._returns = np.empty((0, 2))
+
+    @property
+    def has_seen(self) -> bool:
+        """Whether there is a map that the next scan can be compared with."""
+        return not self._registration.is_empty
+
+    def returns(self) -> FloatArray:
+        """Points (P, 2) in metres of the last scan in the laser's frame."""
+        return self._returns
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """The first scan."""
-        self.has_seen = bool((scan.ranges > 0).any())
-        return ()
+        """Begins a new map with a scan."""
+        found = self._find_outline(scan)
+        self._registration.begin(found)
+        self._motion = np.zeros(3)
+        self._wheel_pose = scan.wheel_pose
+        return () if self.has_seen else (f"{_describe(found)}: none to compare with yet",)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
         """The step to one more scan."""
-        return Registered(Step(0.0, 0.0, 0.0, np.eye(3)))
+        share = self._share_of_motion(periods, seconds)
+        scan_outline = self._find_outline(scan)
+        guess, spread, is_measured = self._guess(scan, share)
+        before = self._registration.pose
+        cos, sin = np.cos(before[2]), np.sin(before[2])
+        turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        match = self._registration.register(
+            scan_outline, advance(before, guess), turned @ spread @ turned.T, is_measured
+        )
+        step = relative_step(before, match.pose)
+        self._wheel_pose = scan.wheel_pose
+        if match.fits:
+            self._motion, self._held = step / max(share, 1.0), 0.0
+            self._seconds = seconds if seconds else math.nan
+        else:
+            self._held += share
+        notes = _describe_match(match, scan_outline)
+        return Registered(Step(*step.tolist(), match.step, match.noise), notes, match.fits)
 
-    def returns(self) -> FloatArray:
-        """Points (P, 2) of the last scan."""
-        return self._points
+    def _share_of_motion(self, periods: int, seconds: float | None) -> float:
+        """How often the last motion fits into the time since then."""
+        share = float(periods)
+        if seconds and self._seconds > 0:
+            share = seconds / self._seconds
+        return max(0.0, min(share, LONGEST_HOLD - self._held))
+
+    def _guess(self, scan: Scan, share: float) -> tuple[FloatArray, FloatArray, bool]:
+        """The step (3,) that is expected, its covariance (3, 3), and whether it was measured."""
+        if self.wheels and scan.wheel_pose is not None and self._wheel_pose is not None:
+            guess = relative_step(np.array(self._wheel_pose), np.array(scan.wheel_pose))
+            least, part = (WHEELS_DISTANCE, WHEELS_TURN), SLIP
+            is_measured = True
+        else:
+            guess = np.zeros(3)
+            whole = int(share)
+            for _ in range(whole):
+                guess = advance(guess, self._motion)
+            guess = advance(guess, (share - whole) * self._motion)
+            least, part, is_measured = (GUESS_DISTANCE * share, GUESS_TURN * share), 0.5, False
+        distance = least[0] + part * float(np.hypot(guess[0], guess[1]))
+        turn = least[1] + part * abs(float(guess[2]))
+        return guess, np.diag([distance**2, distance**2, turn**2]), is_measured
+
+    def _find_outline(self, scan: Scan) -> Outline:
+        """Points and lines of a scan, undistorted if wanted."""
+        ranges = np.ascontiguousarray(scan.ranges, dtype=np.float64)
+        bearings = scan.bearings
+        if bearings is None:
+            bearings = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
+        limit = self._no_return.limit(ranges, FARTHEST)
+        if self.deskew and scan.times is not None and self._seconds > 0 and self._motion.any():
+            ranges = np.where(ranges < limit, ranges, np.inf)
+            ranges, bearings = deskew(ranges, bearings, scan.times, self._motion / self._seconds)
+            limit = FARTHEST
+        found = outline(find_points(ranges, np.ascontiguousarray(bearings, dtype=np.float64), limit))
+        self._returns = found.returns
+        return found
+
+
+def _describe(scan: Outline) -> str:
+    """What there is to see in a scan that cannot be registered."""
+    if len(scan.returns) == 0:
+        return "no returns"
+    return f"few returns: {len(scan.returns)}, {len(scan.points)} points of them of use"
+
+
+def _describe_match(match: Match, scan: Outline) -> tuple[str, ...]:
+    """Notes on a match, in words."""
+    if match.fits:
+        notes = []
+        if match.is_poor:
+            notes.append("poor match: much of the scan does not fit what was seen before")
+        if match.is_ambiguous:
+            notes.append("ambiguous: the scan fits the map in two places, the better one is taken")
+        if match.held.shape[1]:
+            notes.append(f"held: nothing seen determines {_name_directions(match)}, the last motion goes on")
+        return tuple(notes)
+    if len(scan.points) < FEWEST_POINTS:
+        return (f"{_describe(scan)}, the last motion goes on",)
+    lost = "no match: the scan does not fit what was seen before, the last motion goes on"
+    return (lost, "new map: it begins here") if match.begins_map else (lost,)
+
+
+def _name_directions(match: Match) -> str:
+    """The directions that are not determined, as seen from the laser."""
+    names = []
+    for x, y, heading in match.held.T:
+        if abs(heading) > max(abs(x), abs(y)):
+            names.append("the heading")
+        else:
+            angle = math.degrees(math.atan2(y, x) - match.pose[2])
+            names.append(f"the motion at {(angle + 90) % 180 - 90:.0f} degrees")
+    return " and ".join(names)
 
 
 class Matcher(Model):
@@ -56,15 +193,13 @@ class Matcher(Model):
 
     def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
         super().__init__(options, sensor)
+        self.deskew = "auto"
 
     def tracker(self) -> MatcherTracker:
         """The same in a stream."""
         return MatcherTracker(**self.options)
 
-    def stepper(self) -> Any:
-        """There is none: it looks at whole scans."""
-        raise NotImplementedError
-
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive."""
-        raise NotImplementedError
+        """The steps of one whole drive, those that ``rcnn-odom run`` gives."""
+        undistorted = not drive.is_compensated if self.deskew == "auto" else self.deskew == "on"
+        return estimate_by_tracking(MatcherTracker(deskew=undistorted, **self.options), drive.raw_scans())

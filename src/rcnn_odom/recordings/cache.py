@@ -124,18 +124,7 @@ def encode_recordings(
             _encode(missing, encoder, folder, workers, pool)
         scans = [open_cached(recording, encoder, folder) for recording in recordings]
     drives = [
-        Drive(
-            name=recording.name,
-            key=cache_path(recording, encoder, folder).stem,
-            scans=found,
-            poses=recording.poses,
-            stamps=recording.stamps,
-            camera_from_laser=recording.camera_from_laser,
-            wheel_odometry=recording.wheel_odometry,
-            has_clock=recording.has_clock,
-            is_compensated=recording.is_compensated,
-            read_scan=recording.read_scan,
-        )
+        Drive.of(recording, found, cache_path(recording, encoder, folder).stem)
         for recording, found in zip(recordings, scans, strict=True)
         if found is not None
     ]

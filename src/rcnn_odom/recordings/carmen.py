@@ -11,12 +11,18 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray, planar_to_poses
+from rcnn_odom.geometry import FloatArray, planar_to_poses, poses_to_planar
 from rcnn_odom.recordings.broken_lines import BrokenLines
 from rcnn_odom.recordings.carmen_log.front_laser import FrontLaser
 from rcnn_odom.recordings.carmen_log.lines import PARSERS, LaserLine
 from rcnn_odom.recordings.carmen_log.params import check_field_of_view, find_front_laser
-from rcnn_odom.recordings.carmen_log.truth import find_reference, name_truth, read_truth, wheel_odometry
+from rcnn_odom.recordings.carmen_log.truth import (
+    find_reference,
+    laser_on_robot,
+    name_truth,
+    read_truth,
+    wheel_odometry,
+)
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
@@ -66,7 +72,8 @@ def load(
     front = find_front_laser(path, field_of_view_deg)
     other_lasers: Counter[str] = Counter()
     lines = list(_laser_lines(path, front.laser, other_lasers, strict=True))
-    beams = LogReader.of(lines)
+    wheels = wheel_odometry(lines, laser_on_robot(lines[0]))
+    beams = LogReader.of(lines, wheels)
     poses, about_truth = _find_truth(lines, name, reference)
     notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
     notes += [*_count_doubted(lines), *front.notes, *front.warnings]
@@ -79,8 +86,9 @@ def load(
         stamps=beams.stamps,
         read_scan=beams,
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
-        wheel_odometry=wheel_odometry(lines),
+        wheel_odometry=wheels,
         notes=tuple(notes),
+        has_clock=False,
     )
 
 
@@ -119,8 +127,16 @@ def stream(path: Path, field_of_view_deg: float | None = None) -> ScanStream:
         log.warning("%s: %s", path, warning)
     skipped: Counter[str] = Counter()
     lines = _laser_lines(path, front.laser, skipped, strict=False)
-    scans = (LogReader.of([line])(0) for line in lines)
-    return ScanStream(name=path.name, scans=scans, has_clock=False, skipped=skipped, notes=tuple(front.notes))
+    return ScanStream(
+        name=path.name, scans=_scans(lines), has_clock=False, skipped=skipped, notes=tuple(front.notes)
+    )
+
+
+def _scans(lines: Iterator[LaserLine]) -> Iterator[Scan]:
+    mount = None
+    for line in lines:
+        mount = laser_on_robot(line) if mount is None else mount
+        yield LogReader.of([line], wheel_odometry([line], mount))(0)
 
 
 def _need_log(path: Path) -> None:
@@ -200,7 +216,7 @@ class LogReader:
     Readings at or beyond the maximum range that the log says come as infinite: no return.
 
     All readings lie in one array, (sum of P,), because the number of beams may change within a log;
-    those of a frame begin at its offset (N+1,).
+    those of a frame begin at its offset (N+1,). The laser's poses by the wheels are (N, 3).
     """
 
     readings: FloatArray
@@ -209,14 +225,19 @@ class LogReader:
     spacing: FloatArray
     maximum: FloatArray
     stamps: FloatArray
+    wheels: FloatArray
 
     @classmethod
-    def of(cls, lines: list[LaserLine]) -> "LogReader":
-        """The beams of all lines."""
+    def of(cls, lines: list[LaserLine], wheels: FloatArray) -> "LogReader":
+        """The beams of all lines, and the laser's poses by the robot's wheels, (N, 4, 4)."""
         return cls(
-            np.concatenate([line.readings for line in lines]),
-            np.cumsum([0, *(len(line.readings) for line in lines)]),
-            *(np.array(column) for column in zip(*(line[2:6] for line in lines), strict=True)),
+            readings=np.concatenate([line.readings for line in lines]),
+            offsets=np.cumsum([0, *(len(line.readings) for line in lines)]),
+            first_angle=np.array([line.first_angle for line in lines]),
+            spacing=np.array([line.spacing for line in lines]),
+            maximum=np.array([line.maximum for line in lines]),
+            stamps=np.array([line.stamp for line in lines]),
+            wheels=poses_to_planar(wheels),
         )
 
     def __call__(self, frame: int) -> Scan:
@@ -224,7 +245,8 @@ class LogReader:
         ranges = self.readings[self.offsets[frame] : self.offsets[frame + 1]]
         bearings = self.first_angle[frame] + self.spacing[frame] * np.arange(len(ranges))
         ranges = np.where(ranges >= self.maximum[frame], np.inf, ranges)
-        return Scan(ranges, bearings, stamp=float(self.stamps[frame]))
+        x, y, heading = map(float, self.wheels[frame])
+        return Scan(ranges, bearings, stamp=float(self.stamps[frame]), wheel_pose=(x, y, heading))
 
 
 def _find_log(root: Path, name: str) -> Path:

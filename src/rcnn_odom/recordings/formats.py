@@ -24,6 +24,9 @@ WHAT, PACKAGE = "recording format", "rcnn_odom.recordings"
 ASKED_LAST = ("carmen", "simulated")
 """One knows any file; the other streams nothing and takes a second to be imported."""
 
+OF_THE_ROBOT = ("base", "odom_topic")
+"""Options of a ``stream`` without which the poses would be others: refused where a format has none."""
+
 
 def all_formats(only: str | None = None) -> dict[str, ModuleType]:
     """The formats by their names; imports all of them.
@@ -91,8 +94,9 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
     Args:
         path: of it.
         options: ``topic`` of a bag or of rosbridge's messages, ``ring`` of a KITTI drive or of a point cloud,
-            ``height`` of a point cloud, ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left
-            out; one that the format does not have is told and left out.
+            ``height`` of a point cloud, ``odom_topic``, ``base`` and ``laser_pose`` of a bag's robot,
+            ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left out; one that the format does
+            not have is told and left out, or refused where the poses would be others.
 
     Raises:
         InputError: nothing of the kind, or it cannot be read.
@@ -120,7 +124,9 @@ def _options_for(found: ModuleType, path: Path, options: Mapping[str, Any]) -> d
     """Those of the options that a format's ``stream`` takes."""
     given = {name: value for name, value in options.items() if value is not None}
     taken = signature(found.stream).parameters
-    for name in given.keys() - taken.keys():
+    for name in sorted(given.keys() - taken.keys()):
         kind = found.__name__.rpartition(".")[2]
+        if name in OF_THE_ROBOT:
+            raise InputError(f"{path}: read as {kind}, which has no option {name}; leave it out")
         log.warning("%s: read as %s, which has no option %s; it is left out", path, kind, name)
     return {name: value for name, value in given.items() if name in taken}

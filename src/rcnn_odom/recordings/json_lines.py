@@ -3,7 +3,8 @@
 A line is an object with ``ranges`` (metres, null for no return) or ``points`` ([x, y] in metres, x ahead, y
 to the left), and where known ``stamp`` (seconds). The other names are those of ROS's message LaserScan, as
 rosbridge writes it: ``angle_min``, ``angle_increment`` or ``angle_max`` (radians, counter-clockwise from
-straight ahead), ``range_min``, ``range_max``, ``time_increment``, and ``header`` with its stamp and frame.
+straight ahead), ``range_min``, ``range_max``, ``time_increment``, ``scan_time``, and ``header`` with its
+stamp and frame.
 rosbridge's own ``{"op": "publish", "topic": ..., "msg": {...}}`` around it is taken off.
 """
 
@@ -177,7 +178,10 @@ def _to_scan(message: JSONObject) -> Scan:
     ranges = np.array(
         [_number("a reading", value, math.nan) for value in message["ranges"]], dtype=np.float64
     )
-    angle_min, increment, angle_max = _angles(message) or (0.0, 1.0, math.nan)
+    angles = _angles(message)
+    angle_min, increment, angle_max = angles or (0.0, 1.0, math.nan)
+    # Without angles nobody knows for which part of a turn the beams stand.
+    scan_time = _number("scan_time", message.get("scan_time"), 0.0) if angles else 0.0
     scan = from_laser_scan(
         ranges,
         angle_min=angle_min,
@@ -186,6 +190,7 @@ def _to_scan(message: JSONObject) -> Scan:
         range_min=_number("range_min", message.get("range_min"), 0.0),
         range_max=_number("range_max", message.get("range_max"), math.inf),
         time_increment=_number("time_increment", message.get("time_increment"), 0.0),
+        scan_time=scan_time,
         stamp=stamp,
         frame_id=frame_id,
     )

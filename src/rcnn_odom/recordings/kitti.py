@@ -62,6 +62,7 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
         camera_from_laser=camera_from_laser,
         notes=(f"{len(scans)} scans", *chosen),
+        is_compensated=True,
     )
 
 
@@ -95,6 +96,7 @@ def stream(path: Path, ring: int | None = None) -> ScanStream:
         beams=VELODYNE,
         camera_from_laser=camera_from_laser,
         notes=(f"{len(scans)} scans", *chosen),
+        is_compensated=True,
     )
 
 

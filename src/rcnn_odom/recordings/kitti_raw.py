@@ -22,7 +22,16 @@ from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_lines
-from rcnn_odom.recordings.velodyne_files import VELODYNE, Scans, choose_beam, file_key, list_numbered
+from rcnn_odom.recordings.velodyne_files import (
+    LONGEST_TURN,
+    SHORTEST_TURN,
+    TURN,
+    VELODYNE,
+    Scans,
+    choose_beam,
+    file_key,
+    list_numbered,
+)
 
 READER_VERSION = 2
 """Raised whenever the same files would give other scans."""
@@ -70,7 +79,8 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
     frames = list(scans)
     stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", frames)
     poses = _read_truth(drive, frames, stamps)
-    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring)
+    turns = _read_turns(drive / VELODYNE_FOLDER, frames)
+    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring, turns)
     key = f"kitti_raw {READER_VERSION} {reader.ring} {file_key(scans)}"
     return Recording(
         name=name,
@@ -108,7 +118,8 @@ def stream(path: Path, ring: int | None = None) -> ScanStream:
         camera_from_laser = FORWARD_CAMERA.copy()
         of_camera = ("no calib_velo_to_cam.txt: trajectories are those of a camera in the laser's place",)
     stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", list(scans))
-    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring)
+    turns = _read_turns(drive / VELODYNE_FOLDER, list(scans))
+    reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring, turns)
     return ScanStream(
         name=drive.resolve().name,
         scans=map(reader, range(len(scans))),
@@ -215,6 +226,19 @@ def _read_stamps(path: Path, frames: list[int]) -> FloatArray:
             "file, which has their fractions"
         )
     return stamps
+
+
+def _read_turns(folder: Path, frames: list[int]) -> FloatArray | None:
+    """Seconds (N,) that each turn of the laser took; None where it is not told.
+
+    A turn begins and ends behind the car; ``timestamps.txt`` has the moment between, when the laser looked
+    ahead and triggered the cameras.
+    """
+    first, last = (folder / f"timestamps_{end}.txt" for end in ("start", "end"))
+    if not first.is_file() or not last.is_file():
+        return None
+    turns = _read_stamps(last, frames) - _read_stamps(first, frames)
+    return np.where((turns >= SHORTEST_TURN) & (turns <= LONGEST_TURN), turns, TURN)
 
 
 def _parse_stamp(where: str, text: str) -> float:

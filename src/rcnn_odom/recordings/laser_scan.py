@@ -10,6 +10,8 @@ from rcnn_odom.recordings.scan import Scan
 
 ANGLES_AGREE = 2.0
 """Beams by which angle_max may be off: drivers count the last one differently."""
+LONGEST_SCAN = 10.0
+"""Seconds: what claims to take longer says nothing about its beams."""
 NO_RETURN_CODE = 0.98
 """Of the largest reading: what lies above is at the constant that a laser writes where nothing came back."""
 
@@ -22,6 +24,7 @@ def from_laser_scan(
     range_min: float = 0.0,
     range_max: float = math.inf,
     time_increment: float = 0.0,
+    scan_time: float = 0.0,
     stamp: float | None = None,
     frame_id: str = "",
 ) -> Scan:
@@ -37,7 +40,8 @@ def from_laser_scan(
         angle_max: radians, of the last beam; where the increment is 0 or nan, the beams are even up to it.
         range_min, range_max: metres. At ``range_max`` or beyond it a reading is no return, and infinite here.
             A maximum that is nan or not above the minimum is unknown.
-        time_increment: seconds from one beam to the next; not positive: unknown.
+        time_increment: seconds from one beam to the next; not positive: as ``scan_time`` says.
+        scan_time: seconds from one scan to the next, in which the laser turns once; not positive: unknown.
         stamp: seconds; None where there is no clock.
         frame_id: name of the laser's frame.
 
@@ -50,7 +54,8 @@ def from_laser_scan(
     with np.errstate(over="ignore", invalid="ignore"):  # encoders leave out bearings that are no numbers
         values = np.array(ranges, dtype=np.float64)
         beam = np.arange(len(values), dtype=np.float64)
-        bearings = angle_min + _spacing(angle_min, angle_increment, angle_max, len(values)) * beam
+        spacing = _spacing(angle_min, angle_increment, angle_max, len(values))
+        bearings = angle_min + spacing * beam
     # Comparisons with nan are false.
     if range_max > max(range_min, 0.0) and not has_most_beyond(values, range_max):
         values[values >= range_max] = np.inf
@@ -60,7 +65,7 @@ def from_laser_scan(
     return Scan(
         ranges=values,
         bearings=bearings,
-        times=time_increment * beam if 0 < time_increment < np.inf else None,
+        times=_times(beam, spacing, time_increment, scan_time),
         stamp=stamp,
         frame_id=frame_id,
     )
@@ -90,6 +95,21 @@ def has_most_beyond(ranges: FloatArray, limit: float) -> bool:
     given = ranges[(ranges > 0) & np.isfinite(ranges)]
     measured = given[given < NO_RETURN_CODE * given.max(initial=0.0)]
     return bool(np.count_nonzero(measured > limit) > len(measured) / 2)
+
+
+def _times(beam: FloatArray, spacing: float, time_increment: float, scan_time: float) -> FloatArray | None:
+    """Seconds (P,) of beams (P,) after the first; None: nothing tells, or nothing that can be.
+
+    A laser of less than 360 degrees turns on unseen: its beams take only their part of the turn.
+    """
+    if not time_increment > 0:  # so it is of nan
+        time_increment = scan_time * abs(spacing) / (2 * math.pi) if scan_time <= LONGEST_SCAN else math.nan
+    return checked_times(time_increment * beam) if 0 < time_increment < math.inf else None
+
+
+def checked_times(times: FloatArray) -> FloatArray | None:
+    """Seconds (P,) of beams after their scan's stamp; None where one is more than ten or no number."""
+    return times if bool((np.abs(times) <= LONGEST_SCAN).all()) else None
 
 
 def _spacing(angle_min: float, angle_increment: float, angle_max: float, count: int) -> float:

@@ -1,8 +1,12 @@
-"""Parts of recordings, as ``data.train``, ``data.val`` and ``data.test`` name them: ``NAME[0.0:0.85]``."""
+"""Parts of recordings, as ``data.train``, ``data.val`` and ``data.test`` name them: ``NAME[0.0:0.85]``.
+
+``NAME[::3]`` takes every third scan, ``NAME[0.5::3]`` every third of the second half.
+"""
 
 import logging
 import re
 from collections.abc import Mapping
+from typing import NamedTuple
 
 import numpy as np
 
@@ -15,24 +19,48 @@ FRACTION = r"(?:\d+\.?\d*|\.\d+)?"
 """A number without a sign, or nothing."""
 
 
-def parse_part(name: str) -> tuple[str, float, float]:
-    """``NAME`` or ``NAME[a:b]`` -> name and the fractions of the recording where the part lies.
+class Part(NamedTuple):
+    """Which scans of which recording.
+
+    Attributes:
+        file: name of the recording.
+        start, stop: fractions of the recording, between which the part lies.
+        every: 3 for each third scan of it.
+    """
+
+    file: str
+    start: float = 0.0
+    stop: float = 1.0
+    every: int = 1
+
+
+def parse_part(name: str) -> Part:
+    """What ``NAME``, ``NAME[a:b]`` or ``NAME[a:b:n]`` asks for.
 
     Raises:
-        InputError: the brackets do not hold fractions with a < b.
+        InputError: the brackets do not hold fractions with a < b, or n is no whole number from 1 on.
 
     >>> parse_part("10[0.25:]")
-    ('10', 0.25, 1.0)
+    Part(file='10', start=0.25, stop=1.0, every=1)
+    >>> parse_part("10[::3]").every
+    3
     """
-    match = re.fullmatch(rf"(.+?)\[({FRACTION}):({FRACTION})\]", name)
+    match = re.fullmatch(rf"(.+?)\[({FRACTION}):({FRACTION})(?::([^:\]]*))?\]", name)
     if match is None:
         if "[" in name:
-            raise InputError(f"sequence {name!r}: a part is written NAME[0.0:0.85], fractions of the drive")
-        return name, 0.0, 1.0
-    start, stop = float(match[2] or 0), float(match[3] or 1)
+            raise InputError(
+                f"sequence {name!r}: a part is written NAME[0.0:0.85], fractions of the drive, every third "
+                "scan NAME[::3]"
+            )
+        return Part(name)
+    start, stop, every = float(match[2] or 0), float(match[3] or 1), match[4] or "1"
     if not 0 <= start < stop <= 1:
         raise InputError(f"sequence {name!r}: a part needs two fractions between 0 and 1, the smaller first")
-    return match[1], start, stop
+    if not re.fullmatch(r"[0-9]{1,9}", every) or int(every) < 1:
+        raise InputError(
+            f"sequence {name!r}: after the second colon comes a whole number from 1 on, as in NAME[::3]"
+        )
+    return Part(match[1], start, stop, int(every))
 
 
 def cut(drives: Mapping[str, Drive], name: str) -> Drive:
@@ -40,14 +68,14 @@ def cut(drives: Mapping[str, Drive], name: str) -> Drive:
 
     Args:
         drives: whole recordings by their name.
-        name: of a recording, or ``NAME[a:b]``.
+        name: of a recording, or ``NAME[a:b]`` or ``NAME[a:b:n]``.
 
     Raises:
         InputError: the truth has gaps inside, or fewer than two frames are left.
     """
-    file, start, stop = parse_part(name)
+    file, start, stop, every = parse_part(name)
     whole = drives[file]
-    part = whole.part(round(start * len(whole)), round(stop * len(whole)), name)
+    part = whole.part(round(start * len(whole)), round(stop * len(whole)), name).thin(every)
     known = np.flatnonzero(np.isfinite(part.poses).all((1, 2)))
     if len(known) < 2:
         raise InputError(
@@ -55,11 +83,12 @@ def cut(drives: Mapping[str, Drive], name: str) -> Drive:
             "recording or part, or a truth that knows more of it"
         )
     first, last = int(known[0]), int(known[-1])
+    assert part.frames is not None
     if len(known) != last - first + 1:
         gap = int(np.flatnonzero(np.diff(known) > 1)[0])
         raise InputError(
-            f"sequence {file}: the truth is unknown at frame {round(start * len(whole)) + known[gap] + 1}, "
-            "between known ones; use parts of it, NAME[a:b]"
+            f"sequence {file}: the truth is unknown at frame {part.frames[int(known[gap]) + 1]}, between "
+            "known ones; use parts of it, NAME[a:b]"
         )
     if len(known) != len(part):
         log.info("%s: frames %d to %d of %d, where the truth is known", name, first, last, len(part))

@@ -57,7 +57,7 @@ class Drive:
     """A recording, or a part of one, as estimators and scores are given it.
 
     Attributes:
-        name: of the recording; of a part ``NAME[a:b]``.
+        name: of the recording; of a part ``NAME[a:b]`` or ``NAME[a:b:n]``.
         key: changes whenever ``scans`` does.
         scans: (N, bins) float32, the encoded scans: depth vectors in metres; no bins for models that do not
             look at them.
@@ -79,6 +79,27 @@ class Drive:
     is_compensated: bool = False
     read_scan: ReadScan | None = None
     frames: range | None = None
+
+    @classmethod
+    def of(cls, recording: Recording, scans: npt.NDArray[np.float32], key: str) -> "Drive":
+        """A whole recording with its encoded scans (N, bins) and their key."""
+        return cls(
+            name=recording.name,
+            key=key,
+            scans=scans,
+            poses=recording.poses,
+            stamps=recording.stamps,
+            camera_from_laser=recording.camera_from_laser,
+            wheel_odometry=recording.wheel_odometry,
+            has_clock=recording.has_clock,
+            is_compensated=recording.is_compensated,
+            read_scan=recording.read_scan,
+        )
+
+    @classmethod
+    def unencoded(cls, recording: Recording) -> "Drive":
+        """A whole recording for models that look at whole scans."""
+        return cls.of(recording, np.empty((len(recording), 0), np.float32), recording.fingerprint)
 
     def __len__(self) -> int:
         return len(self.scans)
@@ -116,4 +137,16 @@ class Drive:
             stamps=self.stamps[start:stop],
             wheel_odometry=None if wheel is None else wheel[start:stop],
             frames=(self.frames or range(len(self)))[start:stop],
+        )
+
+    def thin(self, every: int) -> "Drive":
+        """The first frame and every ``every``-th after it, without a copy; 1: all."""
+        wheel = self.wheel_odometry
+        return replace(
+            self,
+            scans=self.scans[::every],
+            poses=self.poses[::every],
+            stamps=self.stamps[::every],
+            wheel_odometry=None if wheel is None else wheel[::every],
+            frames=(self.frames or range(len(self)))[::every],
         )

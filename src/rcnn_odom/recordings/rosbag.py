@@ -1,14 +1,13 @@
 """ROS bags with LaserScan or PointCloud2 messages: ROS 1, ROS 2 sqlite3 and mcap; no ROS is needed.
 
-Only the topic that is asked for is looked at, and its messages are read by the types that ROS itself has:
-what a bag says about other topics, or about its types, cannot keep it from being read.
+Only the topics that are asked for are looked at, and their messages are read by the types that ROS itself
+has: what a bag says about other topics, or about its types, cannot keep it from being read.
 """
 
 import logging
 from collections import Counter
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from functools import cache
 from itertools import islice
 from pathlib import Path
 from typing import Any, TypeVar
@@ -18,10 +17,18 @@ import numpy as np
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.bags.chunks import BrokenBag
 from rcnn_odom.recordings.bags.files import MENDED_BY, METADATA, Bag, is_bag, open_bag
-from rcnn_odom.recordings.bags.point_cloud import PLANE, Cloud, choose_cut, estimate_beams, read_cloud
-from rcnn_odom.recordings.bags.topics import LASER_SCAN, Topic, choose_topic, short_name
+from rcnn_odom.recordings.bags.messages import Clock, deserialize, header_stamp
+from rcnn_odom.recordings.bags.point_cloud import (
+    PLANE,
+    Cloud,
+    choose_cut,
+    estimate_beams,
+    read_cloud,
+    seconds_after,
+)
+from rcnn_odom.recordings.bags.robot import RobotOptions, place_on_robot
+from rcnn_odom.recordings.bags.topics import LASER_SCAN, Topic, choose_topic
 from rcnn_odom.recordings.laser_scan import compare_angles, from_laser_scan
-from rcnn_odom.recordings.packing import import_zstd
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 
@@ -29,8 +36,6 @@ log = logging.getLogger(__name__)
 
 SAMPLED_CLOUDS = 20
 UNREADABLE = "messages that cannot be read"
-ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of a message that ROS 2 packed by itself."""
 
 T = TypeVar("T")
 
@@ -45,6 +50,9 @@ def stream(
     topic: str | None = None,
     ring: int | None = None,
     height: tuple[float, float] | None = None,
+    odom_topic: str | None = None,
+    base: str | None = None,
+    laser_pose: tuple[float, float, float] | None = None,
 ) -> ScanStream:
     """The scans of a bag, in the order of their arrival.
 
@@ -58,15 +66,26 @@ def stream(
         ring: of point clouds, as they number them, or the row of clouds that lie in a grid; None: the most
             level one.
         height: metres from and to, in the frame of the cloud: a slice of point clouds instead of a ring.
+        odom_topic: of the robot's own odometry, with or without its first slash, which gives the scans their
+            ``wheel_pose``. It is moved from the robot's frame (the messages' ``child_frame_id``) to the
+            laser, as far as ``laser_pose`` or /tf_static says where that sits.
+        base: the robot's frame: /tf_static says where the laser sits in it, the stream's ``laser_pose``.
+        laser_pose: x and y in metres and heading in radians of the laser on the robot, in place of what
+            /tf_static says.
 
     Raises:
-        InputError: the bag cannot be opened, has no such topic or several, or cannot be cut so.
+        InputError: the bag cannot be opened, has no such topic or several, or cannot be cut so; or it does
+            not tell where the laser sits on ``base``, or not that it is level.
     """
     bag = open_bag(path)
     try:
         chosen = choose_topic(path, bag, topic)
         found = _stream_lasers if chosen.kind == LASER_SCAN else _stream_clouds
-        return found(path, bag, chosen, ring, height)
+        scans = found(path, bag, chosen, ring, height)
+        if wanted := RobotOptions(odom_topic, base, laser_pose):
+            frame = _first_frame(path, bag, chosen)
+            scans = place_on_robot(scans, path, bag, frame, wanted)
+        return replace(scans, scans=_close_after(bag, scans.scans))
     except BaseException:
         bag.close()
         raise
@@ -90,30 +109,10 @@ def convert(message: Any, arrival: int = 0) -> Scan:
         message.range_min,
         message.range_max,
         message.time_increment,
-        _header_stamp(message) or 1e-9 * arrival,
+        message.scan_time,
+        header_stamp(message) or 1e-9 * arrival,
         message.header.frame_id,
     )
-
-
-def _header_stamp(message: Any) -> float:
-    return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
-
-
-class _Clock:
-    """The stamps of a topic: of the headers, or the times of arrival where the first header has none.
-
-    The two are not mixed, since they may be of clocks that know nothing of each other.
-    """
-
-    def __init__(self) -> None:
-        self._has_headers: bool | None = None
-
-    def stamp(self, message: Any, arrival: int) -> float | None:
-        """Seconds; None where the header of a single message has no time."""
-        stamp = _header_stamp(message)
-        if self._has_headers is None:
-            self._has_headers = stamp != 0
-        return (stamp or None) if self._has_headers else 1e-9 * arrival
 
 
 def _stream_lasers(
@@ -125,7 +124,7 @@ def _stream_lasers(
             f"{path}: {topic.name} holds LaserScan messages, of which there is no {given} to choose; leave "
             f"--{given} out, or choose a topic with PointCloud2 messages with --topic"
         )
-    skipped, clock, told = Counter[str](), _Clock(), list[str]()
+    skipped, clock, told = Counter[str](), Clock(), list[str]()
 
     def to_scan(message: Any, arrival: int) -> Scan:
         scan = replace(convert(message), stamp=clock.stamp(message, arrival))
@@ -138,7 +137,7 @@ def _stream_lasers(
 
     return ScanStream(
         name=_name_of(path),
-        scans=_close_after(bag, _read(path, bag, topic, to_scan, skipped)),
+        scans=_read(path, bag, topic, to_scan, skipped),
         total=topic.messages,
         notes=(f"{topic.messages} scans of {topic.name}", *bag.notes),
         skipped=skipped,
@@ -154,16 +153,18 @@ def _stream_clouds(
     except ValueError as error:
         raise InputError(f"{path}: {topic.name} cannot be cut to a planar scan: {error}") from error
 
-    skipped, clock = Counter[str](), _Clock()
+    skipped, clock = Counter[str](), Clock()
 
     def to_scan(message: Any, arrival: int) -> Scan:
-        points = cut(read_cloud(message))
-        return Scan.from_points(points, clock.stamp(message, arrival), message.header.frame_id)
+        cloud, stamp = read_cloud(message), clock.stamp(message, arrival)
+        seen = cut(cloud)
+        times = None if cloud.times is None else seconds_after(stamp, cloud.times[seen])
+        return Scan.from_points(cloud.points[seen], stamp, message.header.frame_id, times)
 
     is_ring = height is None and any(np.ptp(cloud.points[:, 2]) > PLANE for cloud in clouds)
     return ScanStream(
         name=_name_of(path),
-        scans=_close_after(bag, _read(path, bag, topic, to_scan, skipped)),
+        scans=_read(path, bag, topic, to_scan, skipped),
         total=topic.messages,
         beams=estimate_beams(clouds, cut) if is_ring else None,
         notes=(f"{topic.messages} point clouds of {topic.name}", about, *bag.notes),
@@ -197,6 +198,11 @@ def _sample_clouds(path: Path, bag: Bag, topic: Topic) -> list[Cloud]:
     return sample
 
 
+def _first_frame(path: Path, bag: Bag, topic: Topic) -> str:
+    messages = _read(path, bag, topic, lambda message, _: str(message.header.frame_id), Counter())
+    return next(messages)
+
+
 def _close_after(bag: Bag, scans: Iterator[Scan]) -> Iterator[Scan]:
     try:
         yield from scans
@@ -216,7 +222,7 @@ def _read(
     try:
         for encoding, arrival, content in bag.messages(topic.name, topic.kind):
             try:
-                value = convert(_deserialize(content, encoding, topic.kind), arrival)
+                value = convert(deserialize(content, encoding, topic.kind), arrival)
             except ValueError as error:
                 skipped[UNREADABLE] += 1
                 why = why or str(error)
@@ -235,36 +241,3 @@ def _read(
         raise InputError(
             f"{path}: no message of {topic.name} in it; choose another topic, or record it again"
         )
-
-
-def _deserialize(content: memoryview, encoding: str, kind: str) -> Any:
-    """A message of a type of ROS out of its bytes.
-
-    Raises:
-        ValueError: they are none.
-    """
-    if encoding not in ("cdr", "ros1"):
-        raise ValueError(f"it is in {encoding}, not in cdr or ros1")
-    if encoding == "cdr" and content[:4] == ZSTD:
-        content = _unpack(content)
-    try:
-        return _deserializer(encoding)(content, kind)
-    except Exception as error:  # whatever the bytes of a damaged message lead to
-        raise ValueError(f"its {len(content)} bytes are no {short_name(kind)}") from error
-
-
-def _unpack(content: memoryview) -> memoryview:
-    zstd = import_zstd()
-    try:
-        return memoryview(zstd.decompress(content))
-    except zstd.ZstdError as error:
-        raise ValueError("it cannot be unpacked by zstd") from error
-
-
-@cache
-def _deserializer(encoding: str) -> Callable[[memoryview, str], Any]:
-    from rosbags.typesys import Stores, get_typestore
-
-    if encoding == "cdr":
-        return get_typestore(Stores.LATEST).deserialize_cdr
-    return get_typestore(Stores.ROS1_NOETIC).deserialize_ros1  # where a header has a sequence number

@@ -42,12 +42,18 @@ class Scan:
                 )
 
     @classmethod
-    def from_points(cls, points: npt.ArrayLike, stamp: float | None = None, frame_id: str = "") -> "Scan":
+    def from_points(
+        cls,
+        points: npt.ArrayLike,
+        stamp: float | None = None,
+        frame_id: str = "",
+        times: FloatArray | None = None,
+    ) -> "Scan":
         """The returns of a scan given as points.
 
         Args:
             points: (P, 2 or more) metres, x ahead and y to the left.
-            stamp, frame_id: as above.
+            stamp, frame_id, times: as above.
 
         Raises:
             ValueError: another shape.
@@ -59,4 +65,4 @@ class Scan:
         if values.ndim != 2 or values.shape[1] < 2:
             raise ValueError(f"points are (P, 2 or more), not {values.shape}")
         x, y = values[:, 0], values[:, 1]
-        return cls(np.hypot(x, y), np.arctan2(y, x), None, stamp, frame_id, has_all_beams=False)
+        return cls(np.hypot(x, y), np.arctan2(y, x), times, stamp, frame_id, has_all_beams=False)

@@ -290,7 +290,13 @@ def points_at(points: Points, elevation: float, height: float = 0.0) -> Points:
         points: (P, 3 or more) metres, in any order.
         elevation, height: of the beam, see :class:`Beam`.
     """
-    return points[np.abs(elevations_from(points, height) - elevation) < HALF_RING_SPACING, :3]
+    return points[are_at(points, elevation, height), :3]
+
+
+def are_at(points: Points, elevation: float, height: float = 0.0) -> npt.NDArray[np.bool_]:
+    """Which points (P,) are those of :func:`points_at`."""
+    near: npt.NDArray[np.bool_] = np.abs(elevations_from(points, height) - elevation) < HALF_RING_SPACING
+    return near
 
 
 def are_thinned(beams: Sequence[Points]) -> bool:

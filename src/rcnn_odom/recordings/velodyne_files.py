@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +33,12 @@ POINT_BYTES = 16
 LARGEST_POINTER = 1024
 """Bytes of a pointer of Git LFS, at most."""
 VELODYNE = Beams(first=-180.0, covered=360.0, spacing=0.18)
+TURNS = -1
+"""The laser turns clockwise as seen from above; a stamp is of the moment when it looks ahead."""
+TURN = 0.1
+"""Seconds of a turn where no file tells it."""
+SHORTEST_TURN, LONGEST_TURN = 0.02, 0.5
+"""Seconds: what lies outside is no turn."""
 SAMPLED_FRAMES = 20
 FRAMES_OF_BEAM = 5
 """So many frames tell where a beam lies whose points come in any order."""
@@ -148,14 +154,15 @@ def _is_point(line: str, columns: int) -> bool:
 
 
 def choose_beam(
-    paths: Iterable[str | Path], stamps: FloatArray, ring: int | None
+    paths: Iterable[str | Path], stamps: FloatArray, ring: int | None, turns: FloatArray | None = None
 ) -> tuple["BeamReader", tuple[str, ...]]:
     """The reader of one beam for all frames, and words about it.
 
     Args:
         paths: of the frames, at least one.
-        stamps: (N,) seconds.
+        stamps: (N,) seconds, when the laser looked ahead.
         ring: which of the lasers, 0 the first in the file. None: the most level one, see ``LEVEL``.
+        turns: (N,) seconds that each turn took; None: ``TURN``.
 
     Raises:
         InputError: a file cannot be read, there is no such ring, or none near level; or the points are not
@@ -174,8 +181,10 @@ def choose_beam(
     ringed = [rings for rings in split if rings is not None]
     if 2 * len(ringed) < len(clouds):
         disordered = [cloud for cloud, rings in zip(clouds, split, strict=True) if rings is None]
-        return _by_elevation(files, stamps, ring, disordered)
-    return _by_ring(files, stamps, ring, ringed, len(clouds))
+        reader, notes = _by_elevation(files, stamps, ring, disordered)
+    else:
+        reader, notes = _by_ring(files, stamps, ring, ringed, len(clouds))
+    return reader if turns is None else replace(reader, turns=tuple(turns.tolist())), notes
 
 
 def _by_ring(
@@ -287,6 +296,7 @@ class BeamReader:
         ring: number of the laser in the file; None where no frame's points come laser by laser.
         elevation: median of the ring's, seen from the origin of the lowered points.
         rise: metres by which the points are lowered to tell rings, see ``laser_frame.find_rise``.
+        turns: seconds that the turn of each frame took; None: ``TURN``.
     """
 
     paths: tuple[str, ...]
@@ -295,6 +305,7 @@ class BeamReader:
     ring: int | None = None
     elevation: float = float("nan")
     rise: float = 0.0
+    turns: tuple[float, ...] | None = None
 
     def __call__(self, frame: int) -> Scan:
         """Reads one frame.
@@ -302,19 +313,22 @@ class BeamReader:
         Raises:
             InputError: the frame cannot be read or has no such ring. (A blank one has no returns.)
         """
+        scan = Scan.from_points(self._read_points(frame), self.stamps[frame])
+        assert scan.bearings is not None
+        turn = TURN if self.turns is None else self.turns[frame]
+        return replace(scan, times=TURNS * turn / (2 * np.pi) * scan.bearings)
+
+    def _read_points(self, frame: int) -> Points:
         path = self.paths[frame]
         points = lowered(read_points(path), self.rise)
         rings = None if self.ring is None else split_rings(points)
         if self.ring is None or rings is None:
-            fault = "its points do not come laser by laser, and none"
-            return Scan.from_points(self._find_points(points, path, fault), self.stamps[frame])
+            return self._find_points(points, path, "its points do not come laser by laser, and none")
         # In a nearly blank frame of many lasers nobody can count to one of them.
         if self.ring >= len(rings) or (self.ring and len(points) < FEWEST_POINTS):
             has = f"frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count from 0)"
-            return Scan.from_points(
-                self._find_points(points, path, f"{has}, and no point"), self.stamps[frame]
-            )
-        return Scan.from_points(self._find_ring(rings, self.ring), self.stamps[frame])
+            return self._find_points(points, path, f"{has}, and no point")
+        return self._find_ring(rings, self.ring)
 
     def _find_ring(self, rings: list[Points], number: int) -> Points:
         def distance(ring: Points) -> float:

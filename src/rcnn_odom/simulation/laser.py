@@ -5,8 +5,8 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.geometry import FloatArray
-from rcnn_odom.simulation.raycast import NO_WALL, cast
+from rcnn_odom.geometry import FloatArray, wrap_angle
+from rcnn_odom.simulation.raycast import NO_WALL, cast, cast_each
 from rcnn_odom.simulation.scene import Material, Scene
 
 GROUND = Material(returned=0.9, roughness=0.03)
@@ -19,7 +19,7 @@ class Laser:
     Attributes:
         step_deg: azimuth from one shot to the next.
         half_steps: share of shots that follow after half of that; an HDL-64's encoder gives such.
-        field_of_view_deg: symmetric about straight ahead.
+        field_of_view_deg: the part of the circle that it sees.
         max_range: metres.
         rise: metres of the beams' common origin above the laser's.
         elevation_deg: of all beams. Both were fitted to the HDL-64's eighth ring in KITTI, in frames 0 to
@@ -31,6 +31,9 @@ class Laser:
             its chance falls with the power that comes back.
         lost: chance that a shot is lost for no reason of the scene's.
         trembling_deg: standard deviation of a shot's azimuth.
+        noise_share: ``noise`` grows to this share of the range where that is more; None: it does not.
+        facing_deg: where the middle of the field of view points, which is then cut out of a whole ring; None:
+            evenly spaced shots, symmetric about straight ahead.
     """
 
     step_deg: float
@@ -43,11 +46,13 @@ class Laser:
     reach: float = 110.0
     lost: float = 0.006
     trembling_deg: float = 0.0
+    noise_share: float | None = None
+    facing_deg: float | None = None
 
     def look(
         self, scene: Scene, frame: int, pose: FloatArray, rng: np.random.Generator, missing: bool = True
     ) -> npt.NDArray[np.float32]:
-        """One revolution.
+        """One revolution, all of it at once.
 
         Args:
             scene: what there is to see.
@@ -57,36 +62,77 @@ class Laser:
             missing: False: everything within range answers.
 
         Returns:
-            (P, 4) x, y, z in metres in the laser's frame and reflectance 0, as an HDL-64 file has
-            them, by azimuth in [0, 2 pi).
+            The points of the shots that came back, as of :meth:`points`, by azimuth in [0, 2 pi).
         """
-        azimuth = self._azimuths(rng)
-        rise = np.full_like(azimuth, np.tan(np.deg2rad(self.elevation_deg)))
-        own = np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1)
-        start = np.array([0.0, 0.0, self.rise])
-        walls, turn = scene.walls(frame), pose[:3, :3]
-        directions = own @ turn.T
-        depth, hit, squareness = cast(
-            walls, scene.ground, turn @ start + pose[:3, 3], directions, self.max_range
-        )
+        azimuth = self.azimuths(rng)
+        return self.points(azimuth, self.shoot(scene, frame, pose, azimuth, rng, missing))
+
+    def shoot(
+        self,
+        scene: Scene,
+        frame: int,
+        pose: FloatArray,
+        azimuth: FloatArray,
+        rng: np.random.Generator,
+        missing: bool = True,
+    ) -> FloatArray:
+        """Ranges (B,) of shots in metres in the laser's plane, inf where none came back.
+
+        Args:
+            scene, frame, rng, missing: as of :meth:`look`.
+            pose: (4, 4) laser to world, or (B, 4, 4) one for each shot.
+            azimuth: (B,) radians of the shots, in any order.
+        """
+        start, own = self._beams(azimuth)
+        walls, turn = scene.walls(frame), pose[..., :3, :3]
+        if pose.ndim == 2:
+            directions, origin = own @ turn.T, turn @ start + pose[:3, 3]
+            depth, hit, squareness = cast(walls, scene.ground, origin, directions, self.max_range)
+        else:
+            directions, origins = np.einsum("bij,bj->bi", turn, own), turn @ start + pose[:, :3, 3]
+            depth, hit, squareness = cast_each(walls, scene.ground, origins, directions, self.max_range)
         # HIT_GROUND and NO_WALL are the last but one and the last.
         roughness = np.append(walls.roughness, [GROUND.roughness, 0.0])[hit]
         ranges = depth / np.hypot(directions[:, 0], directions[:, 1])
-        ranges += np.hypot(self.noise, roughness) * rng.standard_normal(len(ranges))
+        ranges += np.hypot(self._noise_at(ranges), roughness) * rng.standard_normal(len(ranges))
         luck = rng.random(len(ranges))
         met = (hit != NO_WALL) & (ranges > 0.1) & (ranges < self.max_range)
         if missing:
             chance = np.append(walls.returned, [GROUND.returned, 0.0])[hit]
             power = squareness * (self.reach / depth) ** 2
             met &= luck < (1 - self.lost) * chance * np.minimum(1, power)
+        return np.where(met, ranges, np.inf)
+
+    def points(self, azimuth: FloatArray, ranges: FloatArray) -> npt.NDArray[np.float32]:
+        """The shots that came back as points.
+
+        Args:
+            azimuth: (B,) radians.
+            ranges: (B,) metres, as of :meth:`shoot`.
+
+        Returns:
+            (P, 4) x, y, z in metres in the laser's frame and reflectance 0, as an HDL-64 file has them.
+        """
+        start, own = self._beams(azimuth)
+        met = np.isfinite(ranges)
         points = np.zeros((int(met.sum()), 4), dtype=np.float32)
         points[:, :3] = start + ranges[met, None] * own[met]
         return points
 
-    def _azimuths(self, rng: np.random.Generator) -> FloatArray:
+    def _beams(self, azimuth: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """In the laser's frame: where all beams begin, (3,), and where they go, (B, 3), a metre away."""
+        rise = np.full_like(azimuth, np.tan(np.deg2rad(self.elevation_deg)))
+        return np.array([0.0, 0.0, self.rise]), np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1)
+
+    def _noise_at(self, ranges: FloatArray) -> FloatArray | float:
+        if self.noise_share is None:
+            return self.noise
+        return np.maximum(self.noise, self.noise_share * np.minimum(ranges, self.max_range))
+
+    def azimuths(self, rng: np.random.Generator) -> FloatArray:
         """Radians of every shot, rising from 0 to 2 pi: where they drop, a Velodyne's next ring begins."""
         step, view = self.step_deg, self.field_of_view_deg
-        if view < 360:
+        if view < 360 and self.facing_deg is None:
             shots = round(view / step) + 1
             azimuth = np.deg2rad(np.arange(shots) * step - view / 2)
         else:
@@ -96,6 +142,9 @@ class Laser:
             azimuth = np.deg2rad(turned[turned < 360])
         if self.trembling_deg:
             azimuth = azimuth + np.deg2rad(self.trembling_deg) * rng.standard_normal(len(azimuth))
+        if self.facing_deg is not None:
+            aside = wrap_angle(azimuth - np.deg2rad(self.facing_deg))
+            azimuth = azimuth[np.abs(aside) <= np.deg2rad(view / 2)]
         return np.sort(azimuth % (2 * np.pi))
 
 

@@ -32,18 +32,54 @@ def cast(
         Horizontal depth (B,) in metres, inf where nothing is within ``max_range``; what was hit (B,): the
         index of a wall, ``HIT_GROUND``, or ``NO_WALL``; and how squarely (B,), from 0 along a wall to 1.
     """
+    beams, order = _by_azimuth(directions)
+    depth, hit = _nearest_walls(walls.ends, walls.heights, origin, beams, max_range)
+    origins = np.tile(origin, (len(order), 1))
+    squareness = _after_walls(walls, ground, origins, beams, max_range, depth, hit)
+    back = np.argsort(order)
+    return depth[back], hit[back], squareness[back]
+
+
+def cast_each(
+    walls: Walls, ground: Ground | None, origins: FloatArray, directions: FloatArray, max_range: float
+) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
+    """The same for beams that start each somewhere else, not far from each other, as of a laser on the move.
+
+    Args:
+        walls, ground, directions, max_range: as of :func:`cast`.
+        origins: (B, 3) metres, where the beams start.
+    """
+    beams, order = _by_azimuth(directions)
+    origins = np.ascontiguousarray(origins[order])
+    depth, hit = _nearest_walls_of_each(walls.ends, walls.heights, origins, beams, max_range)
+    squareness = _after_walls(walls, ground, origins, beams, max_range, depth, hit)
+    back = np.argsort(order)
+    return depth[back], hit[back], squareness[back]
+
+
+def _by_azimuth(directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
+    """Beams (4, B) in the order of their azimuth, as rank, x, y and slope, and that order (B,)."""
     rank = _azimuth_rank(directions[:, 0], directions[:, 1])
     order = np.argsort(rank)
     level = np.hypot(directions[:, 0], directions[:, 1])
-    beams = np.stack([rank, *(directions / level[:, None]).T])[:, order]
-    depth, hit = _nearest_walls(walls.ends, walls.heights, origin, beams, max_range)
+    return np.stack([rank, *(directions / level[:, None]).T])[:, order], order
+
+
+def _after_walls(
+    walls: Walls,
+    ground: Ground | None,
+    origins: FloatArray,
+    beams: FloatArray,
+    max_range: float,
+    depth: FloatArray,
+    hit: npt.NDArray[np.int64],
+) -> FloatArray:
+    """How squarely each beam meets what it meets; ``depth`` and ``hit`` where ground is before the walls."""
     squareness = _squareness(walls.ends, hit, beams)
     if ground is not None:
         shape = ground.heights, ground.corner, ground.step, ground.steepest
-        _meet_ground(*shape, origin, beams, max_range, depth, hit, squareness)
-    back = np.empty_like(order)
-    back[order] = np.arange(len(order))
-    return depth[back], hit[back], squareness[back]
+        _meet_ground(*shape, origins, beams, max_range, depth, hit, squareness)
+    return squareness
 
 
 @vectorize(cache=True)
@@ -102,6 +138,62 @@ def _nearest_walls(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
+def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
+    ends, heights, origins, beams, max_range
+):
+    ranks, east, north, slope = beams
+    depth = np.full(len(ranks), np.inf)
+    hit = np.full(len(ranks), NO_WALL)
+    if len(ranks) == 0:
+        return depth, hit
+    middle = origins.sum(axis=0) / len(origins)
+    apart = np.sqrt((origins[:, 0] - middle[0]) ** 2 + (origins[:, 1] - middle[1]) ** 2).max()
+    for wall in range(len(ends)):
+        first_rank, width = _seen_between(ends[wall], middle, apart, max_range)
+        first = np.searchsorted(ranks, first_rank)
+        for later in range(len(ranks)):
+            beam = (first + later) % len(ranks)
+            if (ranks[beam] - first_rank) % 4 > width:
+                break
+            x1, y1 = ends[wall, 0] - origins[beam, 0], ends[wall, 1] - origins[beam, 1]
+            x2, y2 = ends[wall, 2] - origins[beam, 0], ends[wall, 3] - origins[beam, 1]
+            left1, left2 = east[beam] * y1 - north[beam] * x1, east[beam] * y2 - north[beam] * x2
+            if (left1 > 0) == (left2 > 0):  # both ends are on the same side of the beam
+                continue
+            distance = (x1 * y2 - y1 * x2) / (left2 - left1)
+            top = origins[beam, 2] + slope[beam] * distance
+            if 0 < distance < depth[beam] and heights[wall, 0] <= top <= heights[wall, 1]:
+                depth[beam], hit[beam] = distance, wall
+    far = depth >= max_range
+    depth[far], hit[far] = np.inf, NO_WALL
+    return depth, hit
+
+
+@njit(cache=True)
+def _seen_between(wall, middle, apart, max_range):  # type: ignore[no-untyped-def]
+    """The rank of the first beam that may meet a wall, and by how much the last one's is greater.
+
+    No beam starts further than ``apart`` from the middle, so that what is ``near`` metres away is seen at
+    most the arcsine of their ratio beside where the middle sees it; ranks differ by less than angles do.
+    """
+    x1, y1 = wall[0] - middle[0], wall[1] - middle[1]
+    x2, y2 = wall[2] - middle[0], wall[3] - middle[1]
+    long = (x2 - x1) ** 2 + (y2 - y1) ** 2
+    share = 0.0 if long == 0 else min(max(-(x1 * (x2 - x1) + y1 * (y2 - y1)) / long, 0.0), 1.0)
+    near = np.hypot(x1 + share * (x2 - x1), y1 + share * (y2 - y1))
+    if near > max_range + apart:
+        return 0.0, -1.0
+    if near <= apart + 1e-9:
+        return -2.0, 4.0
+    slack = np.arcsin(apart / near) + 1e-9
+    if x1 * y2 < y1 * x2:
+        x1, y1, x2, y2 = x2, y2, x1, y1
+    start = _azimuth_rank(x1, y1)
+    width = (_azimuth_rank(x2, y2) - start) % 4 + 2 * slack
+    return (start - slack + 2) % 4 - 2, width
+
+
+@njit(cache=True)
 def _squareness(ends, hit, beams):  # type: ignore[no-untyped-def]
     _, east, north, _ = beams
     squareness = np.zeros(len(hit))
@@ -114,10 +206,11 @@ def _squareness(ends, hit, beams):  # type: ignore[no-untyped-def]
 
 @njit(cache=True)
 def _meet_ground(  # type: ignore[no-untyped-def]
-    heights, corner, step, steepest, origin, beams, max_range, depth, hit, squareness
+    heights, corner, step, steepest, origins, beams, max_range, depth, hit, squareness
 ):
     _, east, north, slope = beams
     for beam in range(len(slope)):
+        origin = origins[beam]
         above_before = origin[2] - height_at(heights, corner, step, origin[0], origin[1])
         distance = 0.0
         end = min(depth[beam], max_range)

@@ -45,7 +45,8 @@ class OdometryDataModule(L.LightningDataModule):
 
     Args:
         open_recording: name -> recording.
-        train, val, test: names of recordings; ``NAME[0.85:]`` takes a part of one, as fractions of it.
+        train, val, test: names of recordings; ``NAME[0.85:]`` takes a part of one, as fractions of it,
+            ``NAME[::3]`` every third scan.
         sensor: what the depth vectors are like.
         window: pairs in a training window; 1 for the CNNs. batch_size: windows in a batch.
         max_turn_deg, mirror: label-exact augmentation of the training windows; 0 and False: none.
@@ -94,8 +95,15 @@ class OdometryDataModule(L.LightningDataModule):
         self.worlds: FreshWorlds | None = None
         self.windows: Windows | None = None
 
-    def load(self, splits: tuple[str, ...] = ("train", "val", "test")) -> "OdometryDataModule":
+    def load(
+        self, splits: tuple[str, ...] = ("train", "val", "test"), encode: bool = True
+    ) -> "OdometryDataModule":
         """Opens and encodes the drives of these splits.
+
+        Args:
+            splits: of ``train``, ``val`` and ``test``.
+            encode: False for models that look at whole scans: the drives have no depth vectors, and their
+                beams are not compared with the sensor.
 
         Raises:
             InputError: a split is empty; a recording is missing, damaged, of another laser than the sensor,
@@ -104,26 +112,31 @@ class OdometryDataModule(L.LightningDataModule):
         """
         self._check_names(splits)
         wanted = [parse_part(name) for split in splits for name in self.names[split]]
-        files = list(dict.fromkeys(file for file, _, _ in wanted))
+        files = list(dict.fromkeys(part.file for part in wanted))
         recordings = [self.open_recording(file) for file in files]
         for recording in recordings:
             for note in recording.notes:
                 log.info("%s: %s", recording.name, note)
-        encoded = encode_recordings(recordings, self.sensor, self.cache_dir, self.workers)
-        for recording, drive in zip(recordings, encoded, strict=True):
-            self._check_returns(recording, drive)
-        whole = dict(zip(files, encoded, strict=True))
+        drives = self._encode(recordings) if encode else [Drive.unencoded(each) for each in recordings]
+        whole = dict(zip(files, drives, strict=True))
         for split in splits:
             self.drives[split] = [cut(whole, name) for name in self.names[split]]
         self._check_windows()
         return self
+
+    def _encode(self, recordings: list[Recording]) -> list[Drive]:
+        """The recordings with their depth vectors, each with a return at least."""
+        drives = encode_recordings(recordings, self.sensor, self.cache_dir, self.workers)
+        for recording, drive in zip(recordings, drives, strict=True):
+            self._check_returns(recording, drive)
+        return drives
 
     def _check_names(self, splits: tuple[str, ...]) -> None:
         for split in splits:
             if not self.names[split]:
                 raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
         for name in self.names["train"] if "train" in splits else []:
-            whole = parse_part(name)[0]
+            whole = parse_part(name).file
             if self.fresh_epochs and whole != name:
                 raise InputError(
                     f"data.train={name}: new worlds come as whole drives; set data.fresh_worlds=false, "

@@ -15,6 +15,7 @@ from rcnn_odom.evaluation.run_folder import Settings, read_settings
 from rcnn_odom.evaluation.scores import coverage, coverage_table, score_all, table
 from rcnn_odom.geometry import Steps
 from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive
@@ -90,13 +91,14 @@ def load_odometer(checkpoint: str | Path, threads: int = 1) -> Odometer:
         InputError: no such checkpoint.
     """
     graph = to_onnx(load_module(checkpoint).model, "fp32")
-    return Odometer(OnnxStepper(graph.SerializeToString(), threads))
+    return Odometer(PairTracker(OnnxStepper(graph.SerializeToString(), threads)))
 
 
 def _need_unseen(names: list[str], data: Settings) -> None:
     """Compares whole recordings: a training on NAME also sees its new worlds, ``NAME~1`` and so on."""
     used, wanted = (
-        {parse_part(name)[0].split("~")[0] for name in each} for each in (data["train"] + data["test"], names)
+        {parse_part(name).file.split("~")[0] for name in each}
+        for each in (data["train"] + data["test"], names)
     )
     if seen := sorted(used & wanted):
         raise InputError(f"--fit-on: {', '.join(seen)} was trained or is tested on; name other drives")

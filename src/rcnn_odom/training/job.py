@@ -149,6 +149,8 @@ def _explain(error: Exception) -> str:
             return f"{before} has become {now}; set that"
     if found := re.search(r"Could not find '([^']*)/([^'/]*)' Available options in '.*?': (.*)", message):
         group, chosen, names = found.groups()
+        if successor := RENAMED.get(f"{group}={chosen}"):
+            return f"{group}={chosen} has become {successor}; set that"
         return f"{group}={chosen}: there is no such choice; there are {', '.join(names.split())}"
     if found := re.match(r"Could not override '([\w.]+)'", message):
         return _explain_name(found[1])

@@ -3,17 +3,20 @@
 import logging
 import os
 import shlex
+from itertools import islice
 from pathlib import Path
 
 from omegaconf import DictConfig
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.latency import FRAMES, measure, measure_tracker
 from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import BEST, METRICS, Settings, home_of, read_settings
 from rcnn_odom.evaluation.run_report import report_drives
 from rcnn_odom.models.constant import mean_step
-from rcnn_odom.models.contract import find_model
+from rcnn_odom.models.contract import Model, find_model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training.checkpoint import load_module
 from rcnn_odom.training.run_state import write_config, write_json
 from rcnn_odom.training.settings import plain
@@ -74,11 +77,13 @@ def _score_model(chosen: Settings) -> tuple[Settings, Report]:
     data, options = chosen["data"], dict(chosen["model"])
     variant = options.pop("variant")
     model = find_model(variant)(options, Sensor(**data["sensor"]))
-    datamodule = build_datamodule(chosen).load(("test",))
+    model.deskew = data.get("deskew", "auto")
+    datamodule = build_datamodule(chosen).load(("test",), encode=model.uses_depth_vectors)
     drives = datamodule.drives["test"]
     steps = {drive.name: model.estimate(drive) for drive in drives}
     mean = mean_step(datamodule.open_recording, data["train"])
-    scores = report_drives(variant, steps, mean, model.stepper(), drives, data, Path(chosen["run_dir"]))
+    latency = _latency(model, drives[0])
+    scores = report_drives(variant, steps, mean, latency, drives, data, Path(chosen["run_dir"]))
     metrics: Report = {"variant": variant, "data": data["name"], **scores}
     if failures := getattr(model, "failures", None):  # of a model that counts them
         each = (f"{count} of {len(steps[name])} on {name}" for name, count in failures.items())
@@ -86,3 +91,10 @@ def _score_model(chosen: Settings) -> tuple[Settings, Report]:
         metrics["failures"] = failures
     settings = {key: value for key, value in chosen.items() if key not in ("run", "trainer")}
     return settings, metrics
+
+
+def _latency(model: Model, drive: Drive) -> Report:
+    """The time of a frame on this drive, of what the model looks at."""
+    if model.uses_depth_vectors:
+        return measure(model.stepper(), drive.scans)
+    return measure_tracker(model.tracker(), list(islice(drive.raw_scans(), FRAMES + 1)))

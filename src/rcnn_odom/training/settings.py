@@ -25,8 +25,9 @@ RENAMED = {
     "data.epochs": "model.epochs and model.first_stage.epochs",
     "data.passes": "model.epochs and model.first_stage.epochs",
     "data.rotation_classes": "model.rotation_classes",
+    "model=icp": "model=matcher",
 }
-"""Options of earlier versions, and what stands for them now."""
+"""Options and choices of earlier versions, and what stands for them now."""
 
 
 def _names() -> Any:
@@ -65,6 +66,7 @@ class DataOptions:
         fits=_are_lengths, wanted="a list of lengths in metres, for instance [1,2,5]"
     )
     apply: str = option(choices=("start", "middle", "end"))
+    deskew: str = option(choices=("auto", "on", "off"))
     workers: int | None = option(above=0)
 
 
@@ -84,6 +86,7 @@ def plain(cfg: DictConfig) -> Settings:
     """
     given: Any = OmegaConf.to_container(cfg)
     _name_paths(given)
+    _name_deskew(given)
     for name, value in flat(given).items():
         if value == "???":
             raise InputError(f"{name} is missing; give it on the command line, {name}=...")
@@ -101,7 +104,9 @@ def plain(cfg: DictConfig) -> Settings:
         if isinstance(data[split], list):  # where [10] is a number to Hydra, and [00] is not
             data[split] = [str(name) for name in data[split]]
     _name_paths(settings)
+    _name_deskew(settings)
     _check(settings, complete=True)
+    _refuse_deskew(settings)
     if (settings.get("model") or {}).get("apply", data.get("apply")) != data.get("apply"):
         raise InputError("model.apply is that of the data, by which the floor is scored too; set data.apply")
     shorten_if_wanted(settings)
@@ -124,6 +129,24 @@ def _check(settings: Settings, complete: bool) -> None:
 
         check_options(find_model(variant).Options, model, "model.", partly=not complete)
         settings["model"] |= model  # with the defaults of what was left out
+
+
+def _name_deskew(settings: Settings) -> None:
+    """Makes words of ``deskew: on`` and ``off``, which are true and false to YAML."""
+    data = settings.get("data") or {}
+    if isinstance(data.get("deskew"), bool):
+        data["deskew"] = "on" if data["deskew"] else "off"
+
+
+def _refuse_deskew(settings: Settings) -> None:
+    """Refuses ``data.deskew=on`` for models that look at depth vectors, as those of all runs do."""
+    if (settings.get("data") or {}).get("deskew") != "on":
+        return
+    from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
+
+    variant = (settings.get("model") or {}).get("variant")
+    if variant is None or getattr(find_model(variant), "uses_depth_vectors", True):
+        raise InputError("data.deskew=on: networks see scans as they were taken; set data.deskew=auto")
 
 
 def _check_data_names(data: Settings) -> None:

@@ -16,6 +16,7 @@ from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import fitting_lengths
+from rcnn_odom.evaluation.latency import measure
 from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import BEST, LAST, METRICS, Settings, home_of, read_metrics_file
 from rcnn_odom.evaluation.run_report import report_drives
@@ -374,9 +375,9 @@ def score_module(
         trainer.test(module, datamodule=datamodule, verbose=False)
         if module.estimates_file:
             module.estimates = pickle.loads(module.estimates_file.read_bytes())
-    mean_step, stepper = module.mean_step.double().numpy(), module.model.stepper()
-    drives, logger = datamodule.drives["test"], trainer.logger
+    mean_step, drives, logger = module.mean_step.double().numpy(), datamodule.drives["test"], trainer.logger
+    latency = measure(module.model.stepper(), drives[0].scans)
     add_figure = logger.experiment.add_figure if isinstance(logger, TensorBoardLogger) else None
     return report_drives(
-        module.variant, module.estimates, mean_step, stepper, drives, data, folder, add_figure
+        module.variant, module.estimates, mean_step, latency, drives, data, folder, add_figure
     )

@@ -4,9 +4,10 @@ import numpy as np
 import pytest
 
 from conftest import SHARED
-from data.make_bag import FORMATS, START, make_cloud_bag
+from data.make_bag import FORMATS, START, make_cloud_bag, point_cloud, store_of
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings import kitti
+from rcnn_odom.recordings.bags.point_cloud import read_cloud
 from rcnn_odom.recordings.formats import open_stream
 from rcnn_odom.recordings.velodyne import ring_starts
 
@@ -275,3 +276,73 @@ def test_the_ring_of_a_real_laser(tmp_path):
         assert same.sum() > 0.9 * len(reference.ranges)
     assert stream.beams.covered == 360
     assert stream.beams.spacing == pytest.approx(0.18, abs=0.03)
+
+
+# --- when each point was seen --------------------------------------------------------------------
+
+SWEEP = 0.1 * np.tile(np.linspace(0, 1, len(AZIMUTHS), endpoint=False), len(ELEVATIONS))
+"""Seconds of the points of a cloud after the first."""
+
+
+@pytest.mark.parametrize(
+    ("field", "values", "first"),
+    [
+        ("time", (SWEEP - 0.1).astype("f4"), -0.1),  # Velodyne: before the stamp
+        ("time", SWEEP.astype("f4"), 0),
+        ("t", np.round(1e9 * SWEEP).astype("u4"), 0),  # Ouster
+        ("offset_time", np.round(1e9 * SWEEP).astype("u4"), 0),  # Livox
+        ("timestamp", START + SWEEP, 0),  # Hesai, RoboSense
+        ("timestamp", START + SWEEP - 0.1, -0.1),
+        ("timestamp", 1e9 * (START + SWEEP), 0),  # Livox
+    ],
+)
+@pytest.mark.parametrize("kind", FORMATS)
+def test_times_of_points(tmp_path, kind, field, values, first):
+    plain = read(make_cloud_bag(tmp_path, kind, [make_cloud()]))[1][0]
+    (tmp_path / "timed").mkdir()
+    timed = read(make_cloud_bag(tmp_path / "timed", kind, [make_cloud() | {field: values}]))[1][0]
+    np.testing.assert_allclose(timed.times, first + SWEEP[: len(AZIMUTHS)], atol=1e-6)
+    assert plain.times is None
+    np.testing.assert_array_equal(timed.ranges, plain.ranges)
+    np.testing.assert_array_equal(timed.bearings, plain.bearings)
+
+
+@pytest.mark.parametrize(
+    ("field", "values"),
+    [
+        ("time", (1e3 * SWEEP).astype("f4")),  # milliseconds: up to 100 "seconds"
+        ("time", np.where(SWEEP > 0.05, np.nan, SWEEP).astype("f4")),
+        ("time", np.full(len(SWEEP), np.inf, "f4")),
+        ("time", np.zeros(len(SWEEP), "f4")),
+        ("timestamp", START + 100 + SWEEP),
+        ("t", np.round(1e9 * SWEEP * 105).astype("u8").astype("f8")),
+    ],
+)
+def test_times_of_points_that_cannot_be_are_unknown(tmp_path, field, values):
+    scan = read(make_cloud_bag(tmp_path, "mcap", [make_cloud() | {field: values}]))[1][0]
+    assert scan.times is None
+    check_ring(scan, 0, LEVEL_RING)
+
+
+@pytest.mark.parametrize("change", [{"datatype": 9}, {"offset": 1000}])
+def test_a_time_that_cannot_be_read_costs_no_points(change):
+    store = store_of("mcap")
+    cloud = point_cloud(store, make_cloud() | {"time": SWEEP.astype("f4")}, START, False)
+    assert read_cloud(cloud).times is not None
+    for name, value in change.items():
+        setattr(cloud.fields[-1], name, value)
+    assert read_cloud(cloud).times is None
+    assert len(read_cloud(cloud).points) == len(SWEEP)
+
+
+@pytest.mark.parametrize("layout", [{"height": (4.9, 5.1)}, {}])
+def test_times_follow_their_points(tmp_path, layout):
+    """Each point's time is its azimuth, whichever way the cloud is cut."""
+    cloud = make_cloud()
+    cloud["time"] = (0.1 * np.arctan2(cloud["y"], cloud["x"])).astype("f4")
+    cloud["x"][::7] = np.nan
+    if layout:
+        cloud["z"] = np.linspace(0, 10, len(cloud["z"])).astype("f4")
+    scan = read(make_cloud_bag(tmp_path, "sqlite3", [without(cloud, "ring")]), **layout)[1][0]
+    assert len(scan.ranges) > 100
+    np.testing.assert_allclose(scan.times, 0.1 * scan.bearings, atol=1e-6)

@@ -1,5 +1,6 @@
 """ROS's message PointCloud2 of a laser with many beams, cut to what one planar laser sees."""
 
+import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple, TypeAlias
 
@@ -7,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.recordings.beams import Beams, find_beams
+from rcnn_odom.recordings.laser_scan import checked_times
 from rcnn_odom.recordings.velodyne import FARTHEST
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
@@ -15,6 +17,12 @@ RING_FIELDS = ("ring", "channel")
 """Names under which drivers write which of their lasers saw a point."""
 PLANE = 1e-3
 """Metres between the lowest and the highest point of a laser that has a single plane."""
+TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
+"""Names under which drivers write when a point was seen."""
+NANOSECONDS = 1e12
+"""Seconds that no clock shows: such numbers are nanoseconds."""
+LONG_AGO = 1e6
+"""Seconds: such times are not after the stamp of a cloud, but of a clock."""
 SAME_BEAM_DEG = 0.01
 """Bearings closer than this are of one beam, seen twice."""
 MOST_SPREAD = np.deg2rad(1.0)
@@ -34,13 +42,16 @@ class Cloud(NamedTuple):
         points: (P, 3) metres.
         rings: by name of the numbering, (P,) the number of the ring of each point: ``ring`` as the message
             has it; ``row`` and ``column`` of a cloud that lies in a grid.
+        times: (P,) as the message has them, see :func:`seconds_after`; None: it has none.
     """
 
     points: Points
     rings: dict[str, npt.NDArray[np.integer]]
+    times: npt.NDArray[Any] | None = None
 
 
-Cut: TypeAlias = Callable[[Cloud], Points]
+Cut: TypeAlias = Callable[[Cloud], npt.NDArray[np.bool_]]
+"""Which points (P,) of a cloud a planar laser sees."""
 
 
 def read_cloud(message: Any) -> Cloud:
@@ -54,7 +65,8 @@ def read_cloud(message: Any) -> Cloud:
     if missing:
         raise ValueError(f"it has no field {' and no '.join(missing)}, only {', '.join(fields) or 'none'}")
     ring = next((name for name in RING_FIELDS if name in fields), None)
-    grid = _grid(message, [fields[name] for name in ("x", "y", "z", *((ring,) if ring else ()))])
+    time = next((name for name in TIME_FIELDS if _lies_within(fields.get(name), message)), None)
+    grid = _grid(message, [fields[name] for name in ("x", "y", "z", ring, time) if name])
     points = np.stack([grid[name] for name in "xyz"], axis=-1)  # (rows, columns, 3)
     seen = (np.abs(points) < FARTHEST).all(-1) & points.any(-1)  # not so of nan
     rings = {}
@@ -62,7 +74,42 @@ def read_cloud(message: Any) -> Cloud:
         rings["ring"] = np.clip(np.nan_to_num(grid[ring][seen]), -1e9, 1e9).astype(np.int64)
     if len(grid) > 1:
         rings["row"], rings["column"] = np.nonzero(seen)
-    return Cloud(points[seen], rings)
+    return Cloud(points[seen], rings, grid[time][seen] if time else None)
+
+
+def _lies_within(field: Any, message: Any) -> bool:
+    """Whether a field is there and can be read: points without times are points all the same."""
+    if field is None or int(field.datatype) not in TYPES:
+        return False
+    size = np.dtype(TYPES[int(field.datatype)]).itemsize
+    return 0 <= int(field.offset) <= int(message.point_step) - size
+
+
+def seconds_after(stamp: float | None, times: npt.NDArray[Any]) -> npt.NDArray[np.float64] | None:
+    """Seconds (P,) of points after the stamp of their cloud.
+
+    Drivers write whole numbers of nanoseconds (Ouster's ``t``, Livox's ``offset_time``) or seconds as a
+    fraction (Velodyne's ``time``), after the stamp or since 1970 (``timestamp``, Livox's in nanoseconds).
+
+    Args:
+        stamp: seconds; None: unknown.
+        times: (P,) as they are in the message.
+
+    Returns:
+        None where a point is more than ten seconds away or its time no number, and where all are the same.
+    """
+    if not len(times):
+        return np.zeros(0)
+    since = times.min()
+    if not np.isfinite(since) or since == times.max():  # min is nan where one is
+        return None
+    is_nanoseconds = times.dtype.kind in "iu" or abs(since) > NANOSECONDS
+    unit = 1e-9 if is_nanoseconds else 1.0
+    seconds = unit * (times - since).astype(np.float64)  # of large numbers the small difference
+    start = unit * float(since)
+    if abs(start) > LONG_AGO:
+        start = math.nan if stamp is None else start - stamp
+    return checked_times(start + seconds)
 
 
 def _grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
@@ -115,9 +162,10 @@ def choose_cut(
         if ring is not None:
             raise ValueError("a ring and a height are two ways to cut it; give one of them")
         low, high = height
-        return lambda cloud: _between(cloud.points, low, high), f"points at heights of {low:g} to {high:g} m"
+        about = f"points at heights of {low:g} to {high:g} m"
+        return lambda cloud: _between(cloud.points[:, 2], low, high), about
     if ring is None and all(np.ptp(cloud.points[:, 2]) <= PLANE for cloud in clouds):
-        return lambda cloud: cloud.points, "all points, which lie in one plane"
+        return lambda cloud: np.ones(len(cloud.points), bool), "all points, which lie in one plane"
     if ring is None:
         _check_steepness(clouds)
     numbering = _find_numbering(clouds)
@@ -133,7 +181,7 @@ def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
 
     What the laser covers is told by all points of the clouds, since one ring may have no return in a part.
     """
-    spacings = [_spacing_deg(cut(cloud)) for cloud in clouds]
+    spacings = [_spacing_deg(cloud.points[cut(cloud)]) for cloud in clouds]
     known = [spacing for spacing in spacings if spacing is not None]
     if not known:
         return None
@@ -153,8 +201,9 @@ def _check_steepness(clouds: Sequence[Cloud]) -> None:
         raise ValueError(f"{fault}; {IN_ITS_FRAME}")
 
 
-def _between(points: Points, low: float, high: float) -> Points:
-    return points[(points[:, 2] >= low) & (points[:, 2] <= high)]
+def _between(heights: Points, low: float, high: float) -> npt.NDArray[np.bool_]:
+    between: npt.NDArray[np.bool_] = (heights >= low) & (heights <= high)
+    return between
 
 
 def _find_numbering(clouds: Sequence[Cloud]) -> str | None:
@@ -231,17 +280,17 @@ def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tupl
         )
     chosen = ring
 
-    def cut(cloud: Cloud) -> Points:
+    def cut(cloud: Cloud) -> npt.NDArray[np.bool_]:
         if numbering not in cloud.rings:
             raise ValueError(f"it has no {numbering}s")
-        return cloud.points[cloud.rings[numbering] == chosen]
+        return cloud.rings[numbering] == chosen
 
     seen_from = f" from {rise:+.2f} m, where the beams meet" if rise else ""
     return cut, f"{numbering} {ring}, median elevation {np.rad2deg(elevations[ring]):+.2f} degrees{seen_from}"
 
 
 def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
-    from rcnn_odom.recordings.velodyne import find_level_beam, median_elevation, points_at
+    from rcnn_odom.recordings.velodyne import are_at, find_level_beam, median_elevation, points_at
 
     try:
         beam = find_level_beam([cloud.points for cloud in clouds])
@@ -249,7 +298,7 @@ def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
         raise ValueError(f"{error}; cut at a height with --height") from error
     elevation = np.rad2deg(median_elevation(np.concatenate([points_at(c.points, *beam) for c in clouds])))
     about = f"the beam at {elevation:+.2f} degrees is taken by elevation, since the points say no rings"
-    return lambda cloud: points_at(cloud.points, *beam), about
+    return lambda cloud: are_at(cloud.points, *beam), about
 
 
 def _bearings(points: Points) -> npt.NDArray[np.float64]:

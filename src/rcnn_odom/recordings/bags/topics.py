@@ -7,6 +7,7 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.bags.files import MENDED_BY, Bag
 
 LASER_SCAN, POINT_CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
+ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 
 
 class Topic(NamedTuple):
@@ -48,6 +49,27 @@ def choose_topic(path: Path, bag: Bag, wanted: str | None) -> Topic:
         raise _refuse(path, bag, lasers, clouds, wanted, several=found)
     _need_known_encoding(path, bag, found[0])
     return found[0]
+
+
+def choose_odometry(path: Path, bag: Bag, wanted: str) -> str:
+    """The topic of a robot's own odometry.
+
+    Args:
+        path: of the bag, for errors.
+        bag: of which the topic is.
+        wanted: its name, with or without its first slash.
+
+    Raises:
+        InputError: there is none of this name, or its messages are of another type.
+    """
+    topics = [topic for topic in _list_topics(bag) if _is_called(topic, wanted)]
+    found = [topic for topic in topics if topic.kind == ODOMETRY]
+    if found:
+        return found[0].name
+    names = ", ".join(topic.name for topic in _list_topics(bag) if topic.kind == ODOMETRY)
+    wrong = f"{wanted} holds {topics[0].kind or 'messages of no type'}" if topics else f"no topic {wanted}"
+    advice = f"choose one with --odom-topic: {names}" if names else f"it has none with {ODOMETRY}"
+    raise InputError(f"{path}: {wrong}; {advice}, or leave --odom-topic out")
 
 
 def _list_topics(bag: Bag) -> list[Topic]:

@@ -1,5 +1,6 @@
 """Where a robot was: the poses of a CARMEN log itself, its wheel odometry, or a reference beside it."""
 
+from collections.abc import Iterable
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +15,21 @@ ENDINGS = (".gz", ".bz2", ".xz", ".zst", ".log", ".clf")
 REFERENCE_COLUMNS = ("raw_scan_index", "ref_x", "ref_y", "ref_theta")
 
 
-def wheel_odometry(lines: list[LaserLine]) -> FloatArray:
-    """Poses (N, 4, 4) of the laser by the robot's wheels."""
-    wheels = planar_to_poses([line.robot for line in lines])
-    if lines[0].kind == "ROBOTLASER1":
-        wheels = wheels @ (np.linalg.inv(wheels[0]) @ planar_to_poses([lines[0].laser])[0])
-    return wheels
+def laser_on_robot(line: LaserLine) -> FloatArray:
+    """Where the laser sits (4, 4) on the robot whose odometry lines like this one have.
+
+    On ROBOTLASER1 lines the odometry is the robot's, on FLASER lines it is taken as the laser's own.
+    """
+    if line.kind != "ROBOTLASER1":
+        return np.eye(4)
+    robot, laser = planar_to_poses([line.robot, line.laser])
+    mount: FloatArray = np.linalg.inv(robot) @ laser
+    return mount
+
+
+def wheel_odometry(lines: Iterable[LaserLine], mount: FloatArray) -> FloatArray:
+    """Poses (N, 4, 4) of the laser by the robot's wheels; ``mount`` as of :func:`laser_on_robot`."""
+    return planar_to_poses([line.robot for line in lines]) @ mount
 
 
 def name_truth(lines: list[LaserLine]) -> list[str]:

@@ -17,9 +17,17 @@ PERSONAL_SPACE = 0.95
 """Metres from the laser that the middle of a person keeps."""
 SEEN_PEOPLE = 40.0
 """Metres within which people are part of a frame."""
+USUAL_RATE = 4.0
+"""Frames a second for which the paces of people are drawn."""
 
 
-def populate(building: Building, planar: FloatArray, rng: np.random.Generator, people: bool = True) -> Scene:
+def populate(
+    building: Building,
+    planar: FloatArray,
+    rng: np.random.Generator,
+    people: bool = True,
+    scan_rate_hz: float | None = None,
+) -> Scene:
     """All that the laser meets on its way.
 
     Args:
@@ -27,13 +35,15 @@ def populate(building: Building, planar: FloatArray, rng: np.random.Generator, p
         planar: (N, 3) the laser in every frame, as of ``random_walk``.
         rng: where all chance comes from.
         people: whether anyone is about.
+        scan_rate_hz: frames a second; None: as the robot's of its own choice, ``USUAL_RATE`` or so.
     """
     frames = len(planar)
     count = rng.poisson(2 + np.hypot(*np.diff(planar[:, :2], axis=0).T).sum() / 6) if people else 0
     ways = _ways_of_people(building.floor, planar[rng.integers(frames, size=count), :2], rng)
     if not len(ways):
         return Scene(building.standing, NO_WALLS, np.zeros(frames + 1, dtype=np.int64))
-    middles, walked = _walk_to_and_fro(ways, frames, rng)
+    hurry = 1.0 if scan_rate_hz is None else USUAL_RATE / scan_rate_hz
+    middles, walked = _walk_to_and_fro(ways, frames, hurry, rng)
     middles, there = _make_way(middles, planar[:, None, :2], building.floor)
     legs = _legs(middles, np.arctan2(*(ways[:, 1] - ways[:, 0]).T[::-1]), walked)
     starts = np.concatenate([[0], np.cumsum(there.sum(axis=1) * legs.shape[2])])
@@ -53,12 +63,12 @@ def _ways_of_people(floor: Floor, near: FloatArray, rng: np.random.Generator) ->
 
 
 def _walk_to_and_fro(
-    ways: FloatArray, frames: int, rng: np.random.Generator
+    ways: FloatArray, frames: int, hurry: float, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
     """Where everybody is in every frame (N, P, 2), and how far they have walked (N, P) metres."""
     length = np.hypot(*(ways[:, 1] - ways[:, 0]).T)
     pace = np.exp(rng.uniform(np.log(0.03), np.log(0.3), len(ways))) * (rng.random(len(ways)) < 0.8)
-    walked = rng.uniform(0, 2 * length) + pace * np.arange(frames)[:, None]
+    walked = rng.uniform(0, 2 * length) + hurry * pace * np.arange(frames)[:, None]
     share = np.abs((walked / length + 1) % 2 - 1)
     return ways[:, 0] + share[:, :, None] * (ways[:, 1] - ways[:, 0]), walked
 

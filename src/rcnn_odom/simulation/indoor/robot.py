@@ -1,6 +1,6 @@
 """A robot's drive through a building: errands along free ways, with turns, waits and looks round."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy import ndimage, sparse
@@ -58,19 +58,38 @@ def random_robot(rng: np.random.Generator) -> Robot:
     )
 
 
-def random_walk(building: Building, frames: int, rng: np.random.Generator) -> tuple[FloatArray, FloatArray]:
+def _at_rates(robot: Robot, turn_rate_deg_s: float | None, scan_rate_hz: float | None) -> Robot:
+    """The same robot with another laser's rate, and turning faster or slower."""
+    if scan_rate_hz is not None:
+        step = SPEED / scan_rate_hz
+        robot = replace(robot, step=step, turn=robot.turn / robot.step * step)
+    if turn_rate_deg_s is not None:
+        robot = replace(robot, turn=float(np.deg2rad(turn_rate_deg_s)) * robot.period)
+    return robot
+
+
+def random_walk(
+    building: Building,
+    frames: int,
+    rng: np.random.Generator,
+    turn_rate_deg_s: float | None = None,
+    scan_rate_hz: float | None = None,
+) -> tuple[FloatArray, FloatArray]:
     """A robot's errands through a building.
 
     Args:
         building: where; the robot keeps ``ROOM_TO_DRIVE`` from all that stands in it.
         frames: scans, 1 or more.
         rng: where all chance comes from.
+        turn_rate_deg_s: how fast the robot turns on the spot, but for the drift of its pace; None: at its own
+            rate, 37 to 55 degrees a second.
+        scan_rate_hz: scans a second, but for its clock's stutter; None: its own, 2 to 12.
 
     Returns:
         x, y and heading of the laser in every frame, (N, 3), metres and radians (not wrapped), and the
         frames' stamps (N,) in seconds, the first 0.
     """
-    robot = random_robot(rng)
+    robot = _at_rates(random_robot(rng), turn_rate_deg_s, scan_rate_hz)
     ways = Ways.of(building.floor, rng)
     course = np.array([[*ways.anywhere(rng), rng.uniform(-np.pi, np.pi)]])
     waits = np.array([rng.exponential(5)])

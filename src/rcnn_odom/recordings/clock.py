@@ -32,6 +32,7 @@ class Tick:
 
     Attributes:
         periods: usual periods since the scan before, 1 or more.
+        seconds: since the scan before; None where the stamps do not tell.
         late: why the scan is to be passed over; empty where it is not.
         clock_set: from when to when the clock was set, so that nobody knows how much time has passed; empty
             where it was not.
@@ -39,13 +40,14 @@ class Tick:
     """
 
     periods: int = 1
+    seconds: float | None = None
     late: str = ""
     clock_set: str = ""
     notes: tuple[str, ...] = ()
 
 
 class Clock:
-    """Follows the stamps of one stream; see :class:`rcnn_odom.deployment.odometer.Odometer` for what is told.
+    """Follows the stamps of one stream; see :class:`rcnn_odom.models.tracking.Tracking` for what is told.
 
     Args:
         trained: seconds between scans that the estimator knows; nan: any.
@@ -115,6 +117,8 @@ class Clock:
         """Measured from where the last scan was expected, which follows a jittering clock slowly."""
         self._stamp = stamp
         scans, self._unstamped = 1 + self._unstamped, 0
+        # Between scans without stamps of their own nobody knows how the time is shared out.
+        seconds = stamp - before if scans == 1 else None
         # The median does without single gaps, the mean without bursts.
         middles = [np.median(self._intervals), np.mean(self._intervals)] if len(self._intervals) >= 3 else []
         recent = float(min(middles, default=math.nan))
@@ -122,11 +126,13 @@ class Clock:
         self._intervals.append((stamp - before) / scans)
         if math.isnan(usual):
             self._expected = stamp
-            return Tick()
+            return Tick(1, seconds)
         late = stamp - self._expected - scans * usual
         lost = max(0, round(min(late / usual, FOREVER)))
         self._expected = stamp - (1 - FOLLOWING) * (late - lost * usual)
-        return Tick(1 + lost, notes=self._compare_pace(recent, float(max(middles, default=math.inf))))
+        return Tick(
+            1 + lost, seconds, notes=self._compare_pace(recent, float(max(middles, default=math.inf)))
+        )
 
     def _compare_pace(self, recent: float, most: float) -> tuple[str, ...]:
         """Words about another period than that of training, from the least and the greatest middle."""

@@ -1,0 +1,135 @@
+"""What a match determines and how well: held directions, and the covariance of a pose in the map."""
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+
+from rcnn_odom.geometry import FloatArray, wrap_angle
+from rcnn_odom.matching.outline import Outline
+
+LEAST_NORMAL_NOISE = 0.01
+"""Radians by which normals are off at least."""
+LEAST_INFORMATION = 0.002
+"""Mean square of the residuals' change over metres along a direction or radians: where there is less, as along
+a bare corridor, the guess counts more than the match."""
+MAP_ERROR = 0.006
+"""Metres by which a point of the map is off beside what scans say of themselves."""
+CORRELATED = 1.15
+"""Points whose errors are one: neighbours share the errors of their wall and of its line. Fitted."""
+DRIFTS = np.array([1.2, 0.5])
+"""By how many times the variance of a match a map that moves along drifts in a metre, and in a radian. Fitted."""
+
+
+class Aligned(NamedTuple):
+    """What an alignment found.
+
+    Attributes:
+        pose: (3,) in the map's frame.
+        score: see :func:`rcnn_odom.matching.align.align`.
+        information: (3, 3) on x, y and heading in the map's frame, a mean over the pairs, without what errors
+            of normals feign.
+        weight: sum of the pairs' weights. Points that were left out count too, by the square root: they have
+            smoothed the lines of the others.
+        square: square metres of the error of a point: between the mean square of the residuals, too small
+            since lines smooth, and the scatter of the returns about their lines, to which all that is rough
+            adds.
+        share: part of the points with a partner.
+    """
+
+    pose: FloatArray
+    score: float
+    information: FloatArray
+    weight: float
+    square: float
+    share: float
+
+    @classmethod
+    def of(cls, pose: FloatArray, score: float, found: FloatArray, scan: Outline, aligned: int) -> "Aligned":
+        """Of what :func:`rcnn_odom.matching.align.align` fills in, for so many points of a scan."""
+        information = found[:3] - max(scan.normal_noise, LEAST_NORMAL_NOISE**2) * found[3:6]
+        square = float(np.sqrt(found[6, 1] * scan.scatter)) + MAP_ERROR**2
+        weight = float(found[6, 0]) * float(np.sqrt(len(scan.points) / aligned))
+        return cls(pose, score, information, weight, square, float(found[6, 2]))
+
+
+def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
+    """Puts the guess in place of the match along what the scan does not determine.
+
+    Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016; but
+    gradually, so that nothing jumps where a direction is just determined.
+
+    Returns:
+        The pose (3,), and the directions (3, K) along which mostly the guess stands.
+    """
+    strengths, directions = np.linalg.eigh(aligned.information)
+    share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + np.square(np.maximum(strengths, 0.0)))
+    off = aligned.pose - guess
+    off[2] = wrap_angle(off[2])
+    pose = aligned.pose - directions @ (share * (directions.T @ off))
+    return pose, directions[:, share > 0.5]
+
+
+class Uncertainty:
+    """How wrong the pose in the map and the last step are, carried along with the matches (a Kalman filter).
+
+    The map-relative error of a pose, e, is that of the guess where the scan says nothing, and that of the match
+    where it says enough: e' = (1 - G) (F e + w) + G m, with the guess's error w, the match's error m, the
+    gain G, and F, by which an error of heading moves what lies ahead.
+
+    Attributes:
+        pose: (3, 3) covariance of the last pose in the map's frame.
+    """
+
+    def __init__(self) -> None:
+        self.pose = np.zeros((3, 3))
+
+    def update(
+        self, before: FloatArray, after: FloatArray, guess: FloatArray, aligned: Aligned | None
+    ) -> tuple[FloatArray, FloatArray]:
+        """One match more.
+
+        Args:
+            before, after: poses (3,) in the map's frame.
+            guess: (3, 3) covariance of the guessed step in the map's frame.
+            aligned: the match; None where there is none.
+
+        Returns:
+            Covariances (3, 3) of the step, in the frame of the earlier pose, and of the part of its error that
+            the next step takes back, in the frame of the later pose.
+        """
+        information = np.zeros((3, 3)) if aligned is None else _information(aligned)
+        self.pose, step, noise = _update(self.pose, before, after, guess, information, DRIFTS)
+        return step, noise
+
+
+def _information(aligned: Aligned) -> FloatArray:
+    """Information (3, 3) of a match on the pose in the map's frame."""
+    strengths, directions = np.linalg.eigh(aligned.information)
+    # As in hold_undetermined: what is held is no information.
+    share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + np.square(np.maximum(strengths, 0.0)))
+    strengths = np.maximum(strengths, 0.0) * (1 - share) ** 2
+    return (directions * strengths) @ directions.T * (aligned.weight / (CORRELATED * aligned.square))
+
+
+@njit(cache=True)
+def _update(pose, before, after, guess, information, drifts):  # type: ignore[no-untyped-def]
+    x, y = after[0] - before[0], after[1] - before[1]
+    distance, turn = np.sqrt(x * x + y * y), abs(after[2] - before[2])
+    moved = np.eye(3)
+    moved[0, 2], moved[1, 2] = -y, x
+    carried = moved @ pose @ moved.T
+    prior = carried + guess
+    updated = np.linalg.inv(information + np.linalg.inv(prior))
+    gain = updated @ information
+    rest = np.eye(3) - gain
+    noise = updated @ information @ updated.T
+    step = gain @ carried @ gain.T + rest @ guess @ rest.T
+    step += noise * (1 + drifts[0] * distance + drifts[1] * turn)
+    updated *= 1.0
+    back, back_after = np.eye(3), np.eye(3)
+    for turned, heading in ((back, before[2]), (back_after, after[2])):
+        turned[0, 0] = turned[1, 1] = np.cos(heading)
+        turned[0, 1] = np.sin(heading)
+        turned[1, 0] = -turned[0, 1]
+    return updated, back @ step @ back.T, back_after @ noise @ back_after.T

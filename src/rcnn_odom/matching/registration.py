@@ -1,0 +1,216 @@
+"""Where a laser is in the map of what it has seen lately: registration of one scan after the other."""
+
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from rcnn_odom.geometry import FloatArray, advance, relative_step, wrap_angle
+from rcnn_odom.matching import yaw
+from rcnn_odom.matching.align import Table, align, build_table
+from rcnn_odom.matching.covariance import CORRELATED, Aligned, Uncertainty, hold_undetermined
+from rcnn_odom.matching.local_map import LocalMap
+from rcnn_odom.matching.outline import Outline
+
+FEWEST_POINTS = 6
+"""Points without which a scan cannot be registered: three things that stand alone."""
+MOST_POINTS = 450
+"""Points of a scan that are aligned, every k-th in angular order."""
+VOXEL, MOST_WEIGHT = 0.1, 10.0
+"""Metres, and scans whose mean a cell of the map is; see :class:`LocalMap`."""
+MAP_LENGTH, SHORTEST_MAP = 2.0, 1.5
+"""The map remembers the last metres of the way: so many median ranges of a scan, at least some metres. Further
+back it would hold on to old errors; nearer, lose what has left the field of view."""
+KEY_DISTANCE, KEY_TURN, KEY_SHARE = 0.2, np.deg2rad(10.0), 0.9
+"""A scan is added to the map after so many metres or radians, or when fewer of its points are in the map ..."""
+KEY_LEAST = 0.25
+"""... and it is at least this part of the former away: at rest nothing is added, so that nothing can drift."""
+TABLE_FARTHEST = 120.0
+"""Metres: cells of the map that are farther away are not looked at."""
+WIDE_GATE, NARROW_GATE, GATE_ERRORS = 5.0, 1.0, 3.0
+"""Metres between partners in the first step: where the guess may be anywhere, and at least; otherwise it is
+so many of the recent errors of guesses."""
+GATE_TURN, GATE_FADES = 5.0, 0.9
+"""Metres by which a radian of such an error counts, and by what the largest fades in each scan."""
+GOOD_SCORE, LEAST_SCORE = 0.55, 0.25
+"""Below the former other starts are tried as well; below the latter the scan does not fit the map."""
+ELSEWHERE, ELSEWHERE_TURN, NEARLY = 0.3, np.deg2rad(5.0), 0.85
+"""Metres or radians from which on an alignment is another place, which is a rival with this part of the best
+score."""
+CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.6
+"""Metres where the gate stops, and by what it shrinks in each step."""
+SAME_WALL = np.cos(np.deg2rad(45.0))
+"""Cosine between two normals, below which a pair shows two different walls."""
+CALM = 0.04
+"""Times the gate: residuals of this size keep their weight even where most are smaller. A centimetre at last;
+while the gate is open the few walls across a street must pull as well as the many along it."""
+MOST_STEPS = 30
+SCORE_WIDTH = 0.15
+"""Metres of a residual that counts for nothing in the score."""
+SETTINGS = np.array([CLOSEST_GATE, GATE_SHRINKS, SAME_WALL, CALM, MOST_STEPS, SCORE_WIDTH])
+WEAK_PRIOR = 5e-4 * np.eye(3)
+"""Pull to the guess, beside a mean square of 1 of residuals' change over metres or radians."""
+POINT_ERROR = 0.01
+"""Metres of a usual point's error, against which a measured guess is weighed."""
+TURNS = 3
+"""Peaks of the correlation of normals that are tried as turns."""
+FIRST_SHIFTS = (0.75, 1.5, 3.0, 4.5, -0.75, -1.5)
+"""Metres ahead that are tried as well while the motion is not known yet."""
+FORGET_EVERY = 10
+"""Scans after which the map drops what it has forgotten."""
+MOST_LOST = 5
+"""Scans in a row that do not fit the map, after which a new map begins."""
+
+
+@dataclass(frozen=True, eq=False)
+class Match:
+    """Where a scan was taken.
+
+    Attributes:
+        pose: (3,) x and y in metres and heading in radians in the map's frame.
+        step: (3, 3) covariance of the step from the pose before, in that one's frame.
+        noise: (3, 3) covariance of the part of its error that the next step takes back, in the pose's frame.
+        held: (3, K) directions in the map's frame, of unit length in metres and radians, which the scan does
+            not determine: along them the pose is the guess.
+        fits: the scan fits the map; otherwise the pose is the guess.
+        is_poor: much of it does not fit.
+        is_ambiguous: it fits in another place nearly as well.
+        begins_map: nothing has fitted for a while, and a new map begins with this scan.
+    """
+
+    pose: FloatArray
+    step: FloatArray
+    noise: FloatArray
+    held: FloatArray = field(default_factory=lambda: np.empty((3, 0)))
+    fits: bool = True
+    is_poor: bool = False
+    is_ambiguous: bool = False
+    begins_map: bool = False
+
+
+class Registration:
+    """Registers the scans of one laser against a map that they build.
+
+    Attributes:
+        pose: (3,) of the last scan in the map's frame, x and y in metres and heading in radians.
+        is_empty: there is no map yet.
+        knows_motion: a scan has been registered, so that the next guess has something to go by.
+    """
+
+    def __init__(self) -> None:
+        self._map = LocalMap(VOXEL, MOST_WEIGHT)
+        self.reset()
+
+    def reset(self) -> None:
+        """Forgets the map; the next scan is at the origin."""
+        self._map.clear()
+        self.pose, self.is_empty, self.knows_motion = np.zeros(3), True, False
+        self._key_pose, self._key_normals = np.zeros(3), np.empty((0, 2))
+        self._travelled, self._since, self._added, self._lost = 0.0, 0.0, 0, 0
+        self._table: Table
+        self._guess_error, self._uncertainty = np.inf, Uncertainty()
+
+    def begin(self, scan: Outline) -> None:
+        """Begins a new map with a scan at the present pose."""
+        self._map.clear()
+        self._lost, self._guess_error, self.knows_motion = 0, np.inf, False
+        self._since = self._travelled
+        self.is_empty = len(scan.points) < FEWEST_POINTS
+        if not self.is_empty:
+            self._add(scan)
+
+    def register(self, scan: Outline, guess: FloatArray, spread: FloatArray, trust: bool = False) -> Match:
+        """The pose of one more scan.
+
+        Args:
+            scan: its points and normals.
+            guess: (3,) pose in the map's frame.
+            spread: (3, 3) covariance of the guess in the map's frame.
+            trust: the guess is a measurement, that pulls by its covariance; otherwise it pulls weakly.
+        """
+        if len(scan.points) < FEWEST_POINTS:
+            return self._lose(scan, guess, spread)
+        found, has_rival = self._search(scan, guess, _stiffness(spread) if trust else WEAK_PRIOR)
+        if found.score < LEAST_SCORE:
+            return self._lose(scan, guess, spread)
+        pose, held = hold_undetermined(found, guess)
+        error = float(np.hypot(*(pose - guess)[:2])) + GATE_TURN * abs(float(wrap_angle(pose[2] - guess[2])))
+        fading = 0.0 if np.isinf(self._guess_error) else GATE_FADES * self._guess_error
+        self._guess_error, self._lost, self.knows_motion = max(fading, error), 0, True
+        before, self.pose = self.pose, pose
+        if self._is_key(pose, found.share):
+            self._add(scan)
+        covariances = self._uncertainty.update(before, pose, spread, found)
+        return Match(pose, *covariances, held, True, found.score < GOOD_SCORE, has_rival)
+
+    def _search(self, scan: Outline, guess: FloatArray, stiffness: FloatArray) -> tuple[Aligned, bool]:
+        """The best alignment from the guess on, or where that is poor, from others as well; has it a rival?"""
+        chosen = np.linspace(0, len(scan.points) - 1, min(MOST_POINTS, len(scan.points))).astype(np.int64)
+        points, normals, found = scan.points[chosen], scan.normals[chosen], np.zeros((7, 3))
+
+        def align_from(start: FloatArray, gate: float) -> Aligned:
+            table = self._table
+            pose, score = align(
+                *(points, normals, table.entries, table.starts, table.centre),
+                *(start, guess, stiffness, gate, SETTINGS, found),
+            )
+            return Aligned.of(pose, score, found, scan, len(points))
+
+        gate = min(WIDE_GATE, max(NARROW_GATE, GATE_ERRORS * self._guess_error))
+        best = align_from(guess, gate)
+        if best.score >= GOOD_SCORE and self.knows_motion:
+            return best, False
+        found_all = [best, *(align_from(start, WIDE_GATE) for start in self._other_starts(scan, guess, gate))]
+        best = max(found_all, key=lambda aligned: aligned.score)
+        return best, any(_is_rival(other, best) for other in found_all)
+
+    def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[FloatArray]:
+        """Poses where the laser may be as well: by the turn that the normals tell, or where it was."""
+        starts = [guess] if gate < WIDE_GATE else []
+        starts.append(self.pose)
+        for turn in yaw.turn_candidates(self._key_normals, scan.normals, TURNS):
+            heading = self._key_pose[2] + turn
+            starts += [np.array([x, y, heading]) for x, y in (guess[:2], self.pose[:2])]
+        if not self.knows_motion:
+            starts += [advance(guess, np.array([shift, 0.0, 0.0])) for shift in FIRST_SHIFTS]
+        return starts
+
+    def _lose(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
+        """The guess, for a scan that does not fit the map; after several of them a new map begins there."""
+        self._lost += 1
+        covariances = self._uncertainty.update(self.pose, guess, spread, None)
+        self.pose = guess
+        begins = self._lost > MOST_LOST and len(scan.points) >= FEWEST_POINTS
+        if begins:
+            self.begin(scan)
+        return Match(guess, *covariances, np.eye(3), fits=False, begins_map=begins)
+
+    def _is_key(self, pose: FloatArray, share: float) -> bool:
+        """Whether a scan adds something to the map."""
+        step = relative_step(self._key_pose, pose)
+        away = max(float(np.hypot(step[0], step[1])) / KEY_DISTANCE, abs(float(step[2])) / KEY_TURN)
+        return away > 1 or (away > KEY_LEAST and share < KEY_SHARE)
+
+    def _add(self, scan: Outline) -> None:
+        """Adds a scan at the present pose to the map, which forgets what is too far back."""
+        step = relative_step(self._key_pose, self.pose)
+        self._travelled += float(np.hypot(step[0], step[1]))
+        self._map.add(scan.points, scan.normals, self.pose, self._travelled)
+        seen = MAP_LENGTH * float(np.median(np.hypot(*scan.points.T)))
+        self._since = max(self._since, self._travelled - max(SHORTEST_MAP, seen))
+        self._added += 1
+        if self._added % FORGET_EVERY == 0:
+            self._map.forget(self._since)
+        self._key_pose, self._key_normals = self.pose, scan.normals
+        self._table = build_table(self._map.present(), self._since, self.pose[:2], TABLE_FARTHEST)
+
+
+def _is_rival(other: Aligned, best: Aligned) -> bool:
+    """Whether another place fits a scan nearly as well as the best one."""
+    step = relative_step(best.pose, other.pose)
+    is_elsewhere = float(np.hypot(step[0], step[1])) > ELSEWHERE or abs(float(step[2])) > ELSEWHERE_TURN
+    return is_elsewhere and other.score > NEARLY * best.score
+
+
+def _stiffness(spread: FloatArray) -> FloatArray:
+    """The pull (3, 3) of a measured guess, beside a mean square of 1 of a full scan's residuals' change."""
+    return WEAK_PRIOR + np.linalg.inv(spread) * POINT_ERROR**2 * CORRELATED / MOST_POINTS

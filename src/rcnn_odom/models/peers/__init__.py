@@ -1,0 +1,1 @@
+"""Published matchers of other projects behind this project's contract, to be measured beside ours."""
