@@ -32,8 +32,8 @@ class Step:
         heading: radians, counter-clockwise.
         covariance: (3, 3) of x, y and heading in the frame of the earlier scan; nan where unknown.
         taken_back: (3, 3) covariance of the part of its error that the next step takes back, in the frame of
-            the later scan: the error of a pose in a map, for instance, which is in the step to it and, with the
-            opposite sign, in the step from it. 0: the errors of steps are independent.
+            the later scan: the error of a pose in a map, for instance, which is in the step to it and, with
+            the opposite sign, in the step from it. 0: the errors of steps are independent.
 
     >>> Step(1.0, 0.0, 0.1).array()
     array([1. , 0. , 0.1])
@@ -206,6 +206,12 @@ def _turn(heading: float) -> FloatArray:
 def _without_negative(covariance: FloatArray) -> FloatArray:
     """The nearest matrix (3, 3) that is a covariance; one with nan as it is."""
     if np.isnan(covariance).any():
+        return covariance
+    try:
+        np.linalg.cholesky(covariance)  # a quarter of the time of what follows
+    except np.linalg.LinAlgError:
+        pass
+    else:
         return covariance
     variances, directions = np.linalg.eigh(covariance)
     return (directions * np.maximum(variances, 0.0)) @ directions.T

@@ -15,6 +15,8 @@ from rcnn_odom.matching.numeric import quantile, solve3
 BINS = 1024
 """Of the table of bearings."""
 FEWEST_PAIRS = 6
+COARSE, ENOUGH = 3, 100
+"""Every so-manieth point is enough while the gate closes, if there are so many of them then."""
 SETTLED = 1e-4
 """Metres: a change of the pose below it, and of the heading below a tenth in radians, is the last."""
 DAMPING = 1e-6
@@ -133,12 +135,11 @@ def align(  # type: ignore[no-untyped-def]
     pose = start.copy()
     residuals, sizes, partners = np.empty(n), np.empty(n), np.empty(n, np.int64)
     normal = np.empty((3, 3))
-    last = False
     for step in range(int(most_steps)):
-        last = last or step == int(most_steps) - 1
         cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        stride = COARSE if gate > closest and n >= COARSE * ENOUGH else 1
         paired = 0
-        for i in range(n):
+        for i in range(0, n, stride):
             x = cos * points[i, 0] - sin * points[i, 1] + pose[0] - centre[0]
             y = sin * points[i, 0] + cos * points[i, 1] + pose[1] - centre[1]
             nx = cos * normals[i, 0] - sin * normals[i, 1]
@@ -152,7 +153,7 @@ def align(  # type: ignore[no-untyped-def]
         if paired < FEWEST_PAIRS:
             return pose, 0.0
         scale = max(calm * gate, 1.4826 * quantile(sizes, paired, 0.5))
-        gradient = _sum_up(points, entries, partners, residuals, cos, sin, scale, found)
+        gradient = _sum_up(points, entries, partners, residuals, stride, cos, sin, scale, found)
         found[6, 2] = paired / n
         right = -gradient - stiffness @ (pose - guess)
         normal[:] = found[:3] + stiffness
@@ -160,8 +161,6 @@ def align(  # type: ignore[no-untyped-def]
             normal[k, k] += DAMPING
         change = solve3(normal, right)
         pose += change
-        if last:
-            break
         settled = abs(change[0]) < SETTLED and abs(change[1]) < SETTLED and abs(change[2]) < SETTLED / 10
         if gate == closest and settled:
             break
@@ -174,11 +173,11 @@ def align(  # type: ignore[no-untyped-def]
 
 
 @njit(cache=True)
-def _sum_up(points, entries, partners, residuals, cos, sin, scale, found):  # type: ignore[no-untyped-def]
+def _sum_up(points, entries, partners, residuals, stride, cos, sin, scale, found):  # type: ignore[no-untyped-def]
     """Fills ``found`` of :func:`align` but for the share; the gradient (3,) of half the mean square."""
     across, along = np.zeros((3, 3)), np.zeros((3, 3))
     gradient, total, squares = np.zeros(3), 0.0, 0.0
-    for i in range(len(points)):
+    for i in range(0, len(points), stride):
         j = partners[i]
         if j < 0:
             continue

@@ -5,14 +5,17 @@ from typing import NamedTuple
 import numpy as np
 from numba import njit
 
-from rcnn_odom.geometry import FloatArray, wrap_angle
+from rcnn_odom.geometry import FloatArray
 from rcnn_odom.matching.outline import Outline
 
 LEAST_NORMAL_NOISE = 0.01
 """Radians by which normals are off at least."""
-LEAST_INFORMATION = 0.002
+LEAST_INFORMATION = 0.004
 """Mean square of the residuals' change over metres along a direction or radians: where there is less, as along
 a bare corridor, the guess counts more than the match."""
+WEAK_INFORMATION = 0.03
+"""The same where a match counts by half of what it says of itself: the few points that determine such a direction
+err together."""
 MAP_ERROR = 0.006
 """Metres by which a point of the map is off beside what scans say of themselves."""
 CORRELATED = 1.15
@@ -53,21 +56,32 @@ class Aligned(NamedTuple):
         return cls(pose, score, information, weight, square, float(found[6, 2]))
 
 
-def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, FloatArray]:
+def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Puts the guess in place of the match along what the scan does not determine.
 
     Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016; but
     gradually, so that nothing jumps where a direction is just determined.
 
     Returns:
-        The pose (3,), and the directions (3, K) along which mostly the guess stands.
+        The pose (3,); the directions (3, K) along which mostly the guess stands; and the match's information
+        (3, 3) on the pose in the map's frame.
     """
-    strengths, directions = np.linalg.eigh(aligned.information)
-    share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + np.square(np.maximum(strengths, 0.0)))
-    off = aligned.pose - guess
-    off[2] = wrap_angle(off[2])
-    pose = aligned.pose - directions @ (share * (directions.T @ off))
-    return pose, directions[:, share > 0.5]
+    pose, directions, share, information = _hold(
+        aligned.pose, guess, aligned.information, aligned.weight / (CORRELATED * aligned.square)
+    )
+    return pose, directions[:, share > 0.5], information
+
+
+@njit(cache=True)
+def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
+    strengths, directions = np.linalg.eigh(information)
+    strengths = np.maximum(strengths, 0.0)
+    share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + strengths**2)
+    off = pose - guess
+    off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
+    held = pose - directions @ (share * (directions.T @ off))
+    strengths = of_all * strengths * strengths / (strengths + WEAK_INFORMATION)
+    return held, directions, share, (directions * strengths) @ directions.T
 
 
 class Uncertainty:
@@ -85,31 +99,21 @@ class Uncertainty:
         self.pose = np.zeros((3, 3))
 
     def update(
-        self, before: FloatArray, after: FloatArray, guess: FloatArray, aligned: Aligned | None
+        self, before: FloatArray, after: FloatArray, guess: FloatArray, information: FloatArray
     ) -> tuple[FloatArray, FloatArray]:
         """One match more.
 
         Args:
             before, after: poses (3,) in the map's frame.
             guess: (3, 3) covariance of the guessed step in the map's frame.
-            aligned: the match; None where there is none.
+            information: (3, 3) of the match on the later pose, in the map's frame; 0 where there is none.
 
         Returns:
             Covariances (3, 3) of the step, in the frame of the earlier pose, and of the part of its error that
             the next step takes back, in the frame of the later pose.
         """
-        information = np.zeros((3, 3)) if aligned is None else _information(aligned)
         self.pose, step, noise = _update(self.pose, before, after, guess, information, DRIFTS)
         return step, noise
-
-
-def _information(aligned: Aligned) -> FloatArray:
-    """Information (3, 3) of a match on the pose in the map's frame."""
-    strengths, directions = np.linalg.eigh(aligned.information)
-    # As in hold_undetermined: what is held is no information.
-    share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + np.square(np.maximum(strengths, 0.0)))
-    strengths = np.maximum(strengths, 0.0) * (1 - share) ** 2
-    return (directions * strengths) @ directions.T * (aligned.weight / (CORRELATED * aligned.square))
 
 
 @njit(cache=True)
@@ -126,7 +130,6 @@ def _update(pose, before, after, guess, information, drifts):  # type: ignore[no
     noise = updated @ information @ updated.T
     step = gain @ carried @ gain.T + rest @ guess @ rest.T
     step += noise * (1 + drifts[0] * distance + drifts[1] * turn)
-    updated *= 1.0
     back, back_after = np.eye(3), np.eye(3)
     for turned, heading in ((back, before[2]), (back_after, after[2])):
         turned[0, 0] = turned[1, 1] = np.cos(heading)

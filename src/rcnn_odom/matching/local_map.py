@@ -37,8 +37,16 @@ class LocalMap:
     def add(self, points: FloatArray, normals: FloatArray, pose: FloatArray, travelled: float) -> None:
         """Adds what was seen from a pose (x, y, heading) after so many metres."""
         self.count = _add(
-            points, normals, pose, travelled, self.voxel, self.most_weight,
-            self.cells, self.keys, self.slots, self.count,
+            points,
+            normals,
+            pose,
+            travelled,
+            self.voxel,
+            self.most_weight,
+            self.cells,
+            self.keys,
+            self.slots,
+            self.count,
         )
 
     def present(self) -> FloatArray:
@@ -88,7 +96,10 @@ def _add(points, normals, pose, travelled, voxel, most, cells, keys, slots, coun
         share = 1 / (weight + 1)
         cells[cell, 0] += share * (x - cells[cell, 0])
         cells[cell, 1] += share * (y - cells[cell, 1])
-        nx, ny = cells[cell, 2] + share * (nx - cells[cell, 2]), cells[cell, 3] + share * (ny - cells[cell, 3])
+        nx, ny = (
+            cells[cell, 2] + share * (nx - cells[cell, 2]),
+            cells[cell, 3] + share * (ny - cells[cell, 3]),
+        )
         length = np.sqrt(nx * nx + ny * ny)
         if length > 1e-9:
             cells[cell, 2], cells[cell, 3] = nx / length, ny / length

@@ -37,6 +37,7 @@ class Outline:
         returns: (R, 2) all points of the scan, on lines or not.
         scatter: mean square distance of returns from their lines, in square metres.
         normal_noise: mean square error of the normals in square radians that follows from it.
+        reach: median range of the points in metres.
     """
 
     points: FloatArray
@@ -44,6 +45,7 @@ class Outline:
     returns: FloatArray
     scatter: float
     normal_noise: float
+    reach: float
 
 
 def find_points(ranges: FloatArray, bearings: FloatArray, farthest: float) -> FloatArray:
@@ -103,10 +105,10 @@ def outline(found: FloatArray) -> Outline:
         found: (R, 3) of :func:`find_points`.
     """
     points, normals = np.empty((3 * len(found), 2)), np.empty((3 * len(found), 2))
-    count, scatter, noise = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0)
+    count, scatter, noise, reach = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0)
     if count < FEW_LINES:
         count = _add_things(found, points, normals, count)
-    return Outline(points[:count], normals[:count], found[:, :2], scatter, noise)
+    return Outline(points[:count], normals[:count], found[:, :2], scatter, noise, reach)
 
 
 @njit(cache=True)
@@ -143,7 +145,7 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
     for i in range(total - 2, -1, -1):
         last[i] = i if first[i + 1] == i + 1 else last[i + 1]
     count, low, high = 0, 0, 0
-    scatter, noise = np.empty(n), 0.0
+    scatter, ranges, noise = np.empty(n), np.empty(n), 0.0
     for i in range(extra, extra + n):
         reach = (LINE_REACH + SPARSE_REACH * spacing * radius[i]) ** 2
         low, high = max(low, first[i]), max(high, i)
@@ -176,10 +178,12 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
         points[count, 0], points[count, 1] = x[i] - off * nx, y[i] - off * ny
         normals[count, 0], normals[count, 1] = nx, ny
         # Of a line through m points: their scatter across it over m times that along it.
-        scatter[count] = max(mean - half, 0.0)
+        scatter[count], ranges[count] = max(mean - half, 0.0), radius[i]
         noise += (mean - half) / (m * (mean + half))
         count += 1
-    return count, quantile(scatter, count, TYPICAL) if count else 0.0, noise / max(count, 1)
+    if count == 0:
+        return 0, 0.0, 0.0, 0.0
+    return count, quantile(scatter, count, TYPICAL), noise / count, quantile(ranges, count, 0.5)
 
 
 @njit(cache=True)

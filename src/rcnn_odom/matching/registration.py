@@ -36,6 +36,8 @@ GOOD_SCORE, LEAST_SCORE = 0.55, 0.25
 ELSEWHERE, ELSEWHERE_TURN, NEARLY = 0.3, np.deg2rad(5.0), 0.85
 """Metres or radians from which on an alignment is another place, which is a rival with this part of the best
 score."""
+SUDDEN, SUDDEN_TURN = 0.5, np.deg2rad(20.0)
+"""Metres or radians from the guess, from which on a motion is told as sudden."""
 CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.6
 """Metres where the gate stops, and by what it shrinks in each step."""
 SAME_WALL = np.cos(np.deg2rad(45.0))
@@ -74,6 +76,7 @@ class Match:
         fits: the scan fits the map; otherwise the pose is the guess.
         is_poor: much of it does not fit.
         is_ambiguous: it fits in another place nearly as well.
+        surprise: metres and radians from where the guess led, if that is far; otherwise 0.
         begins_map: nothing has fitted for a while, and a new map begins with this scan.
     """
 
@@ -84,6 +87,7 @@ class Match:
     fits: bool = True
     is_poor: bool = False
     is_ambiguous: bool = False
+    surprise: tuple[float, float] = (0.0, 0.0)
     begins_map: bool = False
 
 
@@ -132,15 +136,22 @@ class Registration:
         found, has_rival = self._search(scan, guess, _stiffness(spread) if trust else WEAK_PRIOR)
         if found.score < LEAST_SCORE:
             return self._lose(scan, guess, spread)
-        pose, held = hold_undetermined(found, guess)
-        error = float(np.hypot(*(pose - guess)[:2])) + GATE_TURN * abs(float(wrap_angle(pose[2] - guess[2])))
+        pose, held, information = hold_undetermined(found, guess)
+        off = float(np.hypot(*(pose - guess)[:2])), abs(float(wrap_angle(pose[2] - guess[2])))
+        is_sudden = self.knows_motion and (off[0] > SUDDEN or off[1] > SUDDEN_TURN)
+        error = off[0] + GATE_TURN * off[1]
         fading = 0.0 if np.isinf(self._guess_error) else GATE_FADES * self._guess_error
         self._guess_error, self._lost, self.knows_motion = max(fading, error), 0, True
         before, self.pose = self.pose, pose
         if self._is_key(pose, found.share):
             self._add(scan)
-        covariances = self._uncertainty.update(before, pose, spread, found)
-        return Match(pose, *covariances, held, True, found.score < GOOD_SCORE, has_rival)
+        covariances = self._uncertainty.update(before, pose, spread, information)
+        return Match(
+            *(pose, *covariances, held),
+            is_poor=found.score < GOOD_SCORE,
+            is_ambiguous=has_rival,
+            surprise=off if is_sudden else (0.0, 0.0),
+        )
 
     def _search(self, scan: Outline, guess: FloatArray, stiffness: FloatArray) -> tuple[Aligned, bool]:
         """The best alignment from the guess on, or where that is poor, from others as well; has it a rival?"""
@@ -177,7 +188,7 @@ class Registration:
     def _lose(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
         """The guess, for a scan that does not fit the map; after several of them a new map begins there."""
         self._lost += 1
-        covariances = self._uncertainty.update(self.pose, guess, spread, None)
+        covariances = self._uncertainty.update(self.pose, guess, spread, np.zeros((3, 3)))
         self.pose = guess
         begins = self._lost > MOST_LOST and len(scan.points) >= FEWEST_POINTS
         if begins:
@@ -195,8 +206,7 @@ class Registration:
         step = relative_step(self._key_pose, self.pose)
         self._travelled += float(np.hypot(step[0], step[1]))
         self._map.add(scan.points, scan.normals, self.pose, self._travelled)
-        seen = MAP_LENGTH * float(np.median(np.hypot(*scan.points.T)))
-        self._since = max(self._since, self._travelled - max(SHORTEST_MAP, seen))
+        self._since = max(self._since, self._travelled - max(SHORTEST_MAP, MAP_LENGTH * scan.reach))
         self._added += 1
         if self._added % FORGET_EVERY == 0:
             self._map.forget(self._since)

@@ -50,6 +50,7 @@ class MatcherTracker:
       begins (*new map*).
     - *held*: what is seen does not determine the motion along a direction; along it the last motion goes on.
     - *poor match*: much of the scan does not fit the map; the estimate stands.
+    - *sudden motion*: half a metre or 20 degrees from where the last motion led; the estimate stands.
     - *ambiguous*: the scan fits the map in two places; the better one is taken.
 
     Args:
@@ -163,6 +164,8 @@ def _describe_match(match: Match, scan: Outline) -> tuple[str, ...]:
             notes.append("poor match: much of the scan does not fit what was seen before")
         if match.is_ambiguous:
             notes.append("ambiguous: the scan fits the map in two places, the better one is taken")
+        if any(match.surprise):
+            notes.append(_describe_surprise(*match.surprise))
         if match.held.shape[1]:
             notes.append(f"held: nothing seen determines {_name_directions(match)}, the last motion goes on")
         return tuple(notes)
@@ -170,6 +173,10 @@ def _describe_match(match: Match, scan: Outline) -> tuple[str, ...]:
         return (f"{_describe(scan)}, the last motion goes on",)
     lost = "no match: the scan does not fit what was seen before, the last motion goes on"
     return (lost, "new map: it begins here") if match.begins_map else (lost,)
+
+
+def _describe_surprise(distance: float, turn: float) -> str:
+    return f"sudden motion: {distance:.2f} m and {math.degrees(turn):.0f} degrees from where the last one led"
 
 
 def _name_directions(match: Match) -> str:
@@ -197,7 +204,7 @@ class Matcher(Model):
 
     def tracker(self) -> MatcherTracker:
         """The same in a stream."""
-        return MatcherTracker(**self.options)
+        return MatcherTracker(deskew=self.deskew != "off", **self.options)
 
     def estimate(self, drive: Drive) -> Steps:
         """The steps of one whole drive, those that ``rcnn-odom run`` gives."""

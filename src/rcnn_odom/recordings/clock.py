@@ -3,6 +3,7 @@
 import math
 from collections import deque
 from dataclasses import dataclass
+from statistics import fmean, median
 
 import numpy as np
 
@@ -120,8 +121,8 @@ class Clock:
         # Between scans without stamps of their own nobody knows how the time is shared out.
         seconds = stamp - before if scans == 1 else None
         # The median does without single gaps, the mean without bursts.
-        middles = [np.median(self._intervals), np.mean(self._intervals)] if len(self._intervals) >= 3 else []
-        recent = float(min(middles, default=math.nan))
+        middles = [median(self._intervals), fmean(self._intervals)] if len(self._intervals) >= 3 else []
+        recent = min(middles, default=math.nan)
         usual = float(np.fmax(recent, self._trained))
         self._intervals.append((stamp - before) / scans)
         if math.isnan(usual):
@@ -131,7 +132,7 @@ class Clock:
         lost = max(0, round(min(late / usual, FOREVER)))
         self._expected = stamp - (1 - FOLLOWING) * (late - lost * usual)
         return Tick(
-            1 + lost, seconds, notes=self._compare_pace(recent, float(max(middles, default=math.inf)))
+            1 + lost, seconds, notes=self._compare_pace(recent, max(middles, default=math.inf))
         )
 
     def _compare_pace(self, recent: float, most: float) -> tuple[str, ...]:

@@ -1,8 +1,8 @@
 """small_gicp: point-to-point ICP from scan to scan.
 
 Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", Journal of Open Source
-Software 9, 2024. Its other ways, ``PLANE_ICP`` and ``GICP``, fit planes to the points: where z = 0
-everywhere, every plane is the floor, and the estimate stands still without a word.
+Software 9, 2024. Its ``PLANE_ICP`` fits planes to the points: where z = 0 everywhere, every plane is
+the floor, and the estimate stands still without a word. Its ``GICP`` gives there what point to point does.
 """
 
 from typing import Any

@@ -16,6 +16,7 @@ from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import METRICS, Settings
 from rcnn_odom.files import write_atomically
 from rcnn_odom.options import check_options, option
+from rcnn_odom.registry import choose
 from rcnn_odom.training.benchmark.measure import one_core, run_timed, score_timed
 from rcnn_odom.training.benchmark.methods import find_method
 from rcnn_odom.training.benchmark.sets import load_sets
@@ -42,6 +43,7 @@ class BenchmarkOptions:
         root: folder of the recordings; what is not there is left out.
         lasers: for the sets to refer to.
         sets: by their names; see :class:`rcnn_odom.training.benchmark.sets.SetOptions`.
+        only: names of the sets that are measured; None: all.
         voxels: metres by the name of a model and the kind of place.
     """
 
@@ -50,6 +52,7 @@ class BenchmarkOptions:
     root: str
     lasers: dict[str, Any]
     sets: dict[str, Any] = option(fits=bool, wanted="sets of recordings by their names")  # noqa: RUF009
+    only: list[Any] | None
     voxels: dict[str, Any]
 
 
@@ -84,7 +87,8 @@ def run_benchmark(cfg: DictConfig) -> Report:
 
 def _measure(options: Settings) -> Report:
     """Scores of the method by set."""
-    sets = load_sets(options["sets"])
+    names = options["only"] or list(options["sets"])
+    sets = load_sets({name: choose("set of benchmark.sets", name, options["sets"]) for name in names})
     make_tracker = find_method(options["method"], options["options"], options["voxels"])
     scores = {}
     for name, loaded in sets.items():

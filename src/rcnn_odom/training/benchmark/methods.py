@@ -61,5 +61,5 @@ def _tracker(
     chosen = ({"voxel": voxels[place]} if place in voxels else {}) | options
     check_options(model.Options, chosen, "benchmark.options.")
     made = model(chosen, loaded.sensor)
-    made.deskew = "off" if loaded.drive.is_compensated else "on"
+    made.deskew = loaded.deskew
     return made.tracker()

@@ -31,6 +31,7 @@ class SetOptions:
         lengths: of the drift's segments in metres.
         frames: first and last frame, both included, of a stretch that is also scored by itself.
         relations: file of relations between scans that people have verified.
+        deskew: as ``data.deskew``, for models that undistort scans.
     """
 
     place: str
@@ -42,6 +43,7 @@ class SetOptions:
     )
     frames: list[Any] | None = None
     relations: str | None = None
+    deskew: str = option(default="auto", choices=("auto", "on", "off"))
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,14 @@ class LoadedSet:
     recording: Recording
     drive: Drive
     scans: list[Scan]
+
+    @property
+    def deskew(self) -> str:
+        """Whether scans are undistorted, ``on`` or ``off``."""
+        wanted: str = self.options["deskew"]
+        if wanted != "auto":
+            return wanted
+        return "off" if self.drive.is_compensated else "on"
 
     @property
     def sensor(self) -> Sensor:
