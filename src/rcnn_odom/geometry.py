@@ -5,7 +5,8 @@ the laser is at one scan, seen from where it was at the scan before: x and y in 
 radians, counter-clockwise. Every estimator gives steps, and everything that scores or draws knows them only.
 """
 
-from dataclasses import dataclass, field, replace
+import math
+from dataclasses import dataclass, field
 
 import numpy as np
 import numpy.typing as npt
@@ -134,7 +135,7 @@ def advance(pose: FloatArray, step: FloatArray) -> FloatArray:
     array([1.      , 2.      , 1.570796])
     """
     x, y, heading = pose
-    cos, sin = np.cos(heading), np.sin(heading)
+    cos, sin = math.cos(heading), math.sin(heading)
     return np.array([x + cos * step[0] - sin * step[1], y + sin * step[0] + cos * step[1], heading + step[2]])
 
 
@@ -144,9 +145,9 @@ def relative_step(pose: FloatArray, later: FloatArray) -> FloatArray:
     >>> relative_step(np.array([1.0, 0.0, np.pi / 2]), np.array([1.0, 2.0, np.pi / 2])).round(6)
     array([2., 0., 0.])
     """
-    cos, sin = np.cos(pose[2]), np.sin(pose[2])
+    cos, sin = math.cos(pose[2]), math.sin(pose[2])
     x, y = later[0] - pose[0], later[1] - pose[1]
-    turn = (later[2] - pose[2] + np.pi) % (2 * np.pi) - np.pi
+    turn = (later[2] - pose[2] + math.pi) % (2 * math.pi) - math.pi
     return np.array([cos * x + sin * y, -sin * x + cos * y, turn])
 
 
@@ -164,10 +165,14 @@ def compound_covariance(pose: FloatArray, covariance: FloatArray, step: Step) ->
     >>> compound_covariance(np.zeros(3), np.diag([0.0, 0.0, 0.01]), ahead).round(6).tolist()
     [[0.0, 0.0, 0.0], [0.0, 0.04, 0.02], [0.0, 0.02, 0.01]]
     """
-    of_pose, of_step = np.eye(3), _turn(pose[2])
-    x, y, _ = of_step @ step.array()
-    of_pose[:2, 2] = -y, x
-    return _carry(of_pose, covariance) + _carry(of_step, step.covariance)
+    return _add_up(pose[2], covariance, step, step.covariance)
+
+
+def _add_up(heading: float, covariance: FloatArray, step: Step, of_step: FloatArray) -> FloatArray:
+    """The covariance after a step from a pose with this heading, with that of the step given apart."""
+    turn = _turn(heading)
+    x, y = turn[0, 0] * step.x + turn[0, 1] * step.y, turn[1, 0] * step.x + turn[1, 1] * step.y
+    return _carry(_lever(x, y), covariance) + _carry(turn, of_step)
 
 
 class AccumulatedCovariance:
@@ -189,29 +194,33 @@ class AccumulatedCovariance:
         """One more step, from this pose, x, y and heading (3,)."""
         lasting = step.covariance
         if self._open.any() or step.taken_back.any():
-            lever = np.array([[1.0, 0.0, -step.y], [0.0, 1.0, step.x], [0.0, 0.0, 1.0]])
-            lasting = lasting - _carry(lever, self._open) - _carry(_turn(step.heading), step.taken_back)
-            lasting = _without_negative(lasting)
+            before = _carry(_lever(step.x, step.y), self._open)
+            lasting = _without_negative(
+                lasting - before - _carry(_turn(step.heading), step.taken_back)
+            )
         self._open = step.taken_back
-        self._drift = compound_covariance(pose, self._drift, replace(step, covariance=lasting))
+        self._drift = _add_up(pose[2], self._drift, step, lasting)
         self.value = self._drift + _carry(_turn(pose[2] + step.heading), self._open)
+
+
+def _lever(x: float, y: float) -> FloatArray:
+    """What an error of the heading does to a place x and y metres away."""
+    return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
 
 
 def _turn(heading: float) -> FloatArray:
     """What turns x and y of a covariance (3, 3) by a heading."""
-    cos, sin = np.cos(heading), np.sin(heading)
+    cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _without_negative(covariance: FloatArray) -> FloatArray:
     """The nearest matrix (3, 3) that is a covariance; one with nan as it is."""
-    if np.isnan(covariance).any():
+    (a, b, c), (_, d, e), (_, _, f) = covariance.tolist()
+    # Positive leading minors, the usual case, are looked at in a tenth of the time of what follows.
+    if a > 0 and a * d > b * b and a * (d * f - e * e) - b * (b * f - c * e) + c * (b * e - c * d) > 0:
         return covariance
-    try:
-        np.linalg.cholesky(covariance)  # a quarter of the time of what follows
-    except np.linalg.LinAlgError:
-        pass
-    else:
+    if np.isnan(covariance).any():
         return covariance
     variances, directions = np.linalg.eigh(covariance)
     return (directions * np.maximum(variances, 0.0)) @ directions.T
@@ -263,9 +272,9 @@ def turn_to_middle(step: Step) -> Step:
 
 def _carry(jacobian: FloatArray, covariance: FloatArray) -> FloatArray:
     """J C J^T, where what is unknown (nan) spreads only to what depends on it."""
-    unknown = np.isnan(covariance)
-    if not unknown.any():
+    if not math.isnan(covariance.sum()):
         return jacobian @ covariance @ jacobian.T
+    unknown = np.isnan(covariance)
     carried = jacobian @ np.where(unknown, 0.0, covariance) @ jacobian.T
     weights = (jacobian != 0).astype(np.float64)
     carried[weights @ unknown @ weights.T > 0] = np.nan

@@ -14,6 +14,8 @@ from rcnn_odom.matching.numeric import quantile, solve3
 
 BINS = 1024
 """Of the table of bearings."""
+BEHIND = 1.0
+"""Metres behind a wall from which on the laser cannot see its face."""
 FEWEST_PAIRS = 6
 COARSE, ENOUGH = 3, 100
 """Every so-manieth point is enough while the gate closes, if there are so many of them then."""
@@ -60,7 +62,8 @@ def _fill_table(cells, since, centre, farthest, entries, starts):  # type: ignor
     for i in range(len(cells)):
         x, y = cells[i, 0] - centre[0], cells[i, 1] - centre[1]
         bins[i] = -1
-        if cells[i, 5] >= since and x * x + y * y < farthest * farthest:
+        behind = x * cells[i, 2] + y * cells[i, 3]
+        if cells[i, 5] >= since and behind < BEHIND and x * x + y * y < farthest * farthest:
             bins[i] = bearing_bin(x, y)
             starts[bins[i] + 1] += 1
     for k in range(BINS):

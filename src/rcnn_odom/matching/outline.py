@@ -17,6 +17,8 @@ SMALL = 0.6
 """Metres across: what stands alone and is smaller is a thing such as a post or a trunk."""
 FEW_LINES = 60
 """Points on lines, from which on things that stand alone are left out: they are less exact."""
+ENOUGH = 600
+"""Lines in a scan: of more points every second one, third one ... has its line fitted."""
 STRAIGHT = 0.1
 """Spread across a line over the spread along it, as variances, above which neighbours are no line."""
 TYPICAL = 0.7
@@ -146,7 +148,7 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
         last[i] = i if first[i + 1] == i + 1 else last[i + 1]
     count, low, high = 0, 0, 0
     scatter, ranges, noise = np.empty(n), np.empty(n), 0.0
-    for i in range(extra, extra + n):
+    for i in range(extra, extra + n, max(1, n // ENOUGH)):
         reach = (LINE_REACH + SPARSE_REACH * spacing * radius[i]) ** 2
         low, high = max(low, first[i]), max(high, i)
         high = min(high, last[i])

@@ -13,7 +13,7 @@ from rcnn_odom.matching.outline import Outline
 
 FEWEST_POINTS = 6
 """Points without which a scan cannot be registered: three things that stand alone."""
-MOST_POINTS = 450
+MOST_POINTS = 300
 """Points of a scan that are aligned, every k-th in angular order."""
 VOXEL, MOST_WEIGHT = 0.1, 10.0
 """Metres, and scans whose mean a cell of the map is; see :class:`LocalMap`."""
@@ -38,7 +38,7 @@ ELSEWHERE, ELSEWHERE_TURN, NEARLY = 0.3, np.deg2rad(5.0), 0.85
 score."""
 SUDDEN, SUDDEN_TURN = 0.5, np.deg2rad(20.0)
 """Metres or radians from the guess, from which on a motion is told as sudden."""
-CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.6
+CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.5
 """Metres where the gate stops, and by what it shrinks in each step."""
 SAME_WALL = np.cos(np.deg2rad(45.0))
 """Cosine between two normals, below which a pair shows two different walls."""
@@ -155,8 +155,7 @@ class Registration:
 
     def _search(self, scan: Outline, guess: FloatArray, stiffness: FloatArray) -> tuple[Aligned, bool]:
         """The best alignment from the guess on, or where that is poor, from others as well; has it a rival?"""
-        chosen = np.linspace(0, len(scan.points) - 1, min(MOST_POINTS, len(scan.points))).astype(np.int64)
-        points, normals, found = scan.points[chosen], scan.normals[chosen], np.zeros((7, 3))
+        points, normals, found = *_thin(scan), np.zeros((7, 3))
 
         def align_from(start: FloatArray, gate: float) -> Aligned:
             table = self._table
@@ -212,6 +211,14 @@ class Registration:
             self._map.forget(self._since)
         self._key_pose, self._key_normals = self.pose, scan.normals
         self._table = build_table(self._map.present(), self._since, self.pose[:2], TABLE_FARTHEST)
+
+
+def _thin(scan: Outline) -> tuple[FloatArray, FloatArray]:
+    """Points and normals (K, 2) of a scan, evenly chosen."""
+    if len(scan.points) <= MOST_POINTS:
+        return scan.points, scan.normals
+    chosen = np.arange(MOST_POINTS) * len(scan.points) // MOST_POINTS
+    return scan.points[chosen], scan.normals[chosen]
 
 
 def _is_rival(other: Aligned, best: Aligned) -> bool:

@@ -102,8 +102,8 @@ class MatcherTracker:
         step = relative_step(before, match.pose)
         self._wheel_pose = scan.wheel_pose
         if match.fits:
-            self._motion, self._held = step / max(share, 1.0), 0.0
-            self._seconds = seconds if seconds else math.nan
+            self._motion, self._held = step if seconds else step / periods, 0.0
+            self._seconds = seconds or math.nan
         else:
             self._held += share
         notes = _describe_match(match, scan_outline)
