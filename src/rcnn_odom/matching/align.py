@@ -112,7 +112,7 @@ def nearest(entries, starts, x, y, nx, ny, gate, same):  # type: ignore[no-untyp
 
 @njit(cache=True)
 def align(  # type: ignore[no-untyped-def]
-    points, normals, entries, starts, centre, start, guess, stiffness, gate, settings, found
+    points, normals, entries, starts, centre, start, guess, stiffness, gate, sparse, settings, found
 ):
     """Moves a scan onto the map.
 
@@ -123,6 +123,7 @@ def align(  # type: ignore[no-untyped-def]
         guess: (3,) pose to which a prior pulls.
         stiffness: (3, 3) of that pull, beside a mean square of 1 of the residuals' change.
         gate: metres between partners in the first step.
+        sparse: radians; times its range it is added to the gate of a point, since far ones are far apart.
         settings: closest gate, by what it shrinks, cosine of normals, calm, most steps, score's width.
         found: (7, 3), gets the information on x, y and heading, a mean over the pairs, in its first three
             rows, that along the walls, on which only errors of normals act, in the next three, and in the last
@@ -147,7 +148,8 @@ def align(  # type: ignore[no-untyped-def]
             y = sin * points[i, 0] + cos * points[i, 1] + pose[1] - centre[1]
             nx = cos * normals[i, 0] - sin * normals[i, 1]
             ny = sin * normals[i, 0] + cos * normals[i, 1]
-            j = nearest(entries, starts, x, y, nx, ny, gate, same)
+            away = sparse * np.sqrt(points[i, 0] ** 2 + points[i, 1] ** 2)
+            j = nearest(entries, starts, x, y, nx, ny, gate + away, same)
             partners[i] = j
             if j >= 0:
                 residuals[i] = (x - entries[j, 0]) * entries[j, 2] + (y - entries[j, 1]) * entries[j, 3]

@@ -16,6 +16,8 @@ a bare corridor, the guess counts more than the match."""
 WEAK_INFORMATION = 0.03
 """The same where a match counts by half of what it says of itself: the few points that determine such a direction
 err together."""
+HARDLY = 0.05
+"""The same below which other places along a direction are tried as well."""
 MAP_ERROR = 0.006
 """Metres by which a point of the map is off beside what scans say of themselves."""
 CORRELATED = 1.15
@@ -70,6 +72,16 @@ def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, 
         aligned.pose, guess, aligned.information, aligned.weight / (CORRELATED * aligned.square)
     )
     return pose, directions[:, share > 0.5], information
+
+
+def weakest_direction(aligned: Aligned) -> FloatArray | None:
+    """The direction (3,), of unit length in the plane, that is hardly determined; None where all are."""
+    values, vectors = np.linalg.eigh(aligned.information)
+    along = vectors[:, 0]
+    if values[0] > HARDLY or abs(along[2]) > 0.7:
+        return None
+    direction: FloatArray = np.array([along[0], along[1], 0.0]) / np.hypot(along[0], along[1])
+    return direction
 
 
 @njit(cache=True)

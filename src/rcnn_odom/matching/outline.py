@@ -40,6 +40,7 @@ class Outline:
         scatter: mean square distance of returns from their lines, in square metres.
         normal_noise: mean square error of the normals in square radians that follows from it.
         reach: median range of the points in metres.
+        spacing: median angle between neighbouring returns in radians.
     """
 
     points: FloatArray
@@ -48,6 +49,7 @@ class Outline:
     scatter: float
     normal_noise: float
     reach: float
+    spacing: float
 
 
 def find_points(ranges: FloatArray, bearings: FloatArray, farthest: float) -> FloatArray:
@@ -107,10 +109,10 @@ def outline(found: FloatArray) -> Outline:
         found: (R, 3) of :func:`find_points`.
     """
     points, normals = np.empty((3 * len(found), 2)), np.empty((3 * len(found), 2))
-    count, scatter, noise, reach = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0)
+    count, *about = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0, 0.0)
     if count < FEW_LINES:
         count = _add_things(found, points, normals, count)
-    return Outline(points[:count], normals[:count], found[:, :2], scatter, noise, reach)
+    return Outline(points[:count], normals[:count], found[:, :2], *about)
 
 
 @njit(cache=True)
@@ -184,8 +186,8 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
         noise += (mean - half) / (m * (mean + half))
         count += 1
     if count == 0:
-        return 0, 0.0, 0.0, 0.0
-    return count, quantile(scatter, count, TYPICAL), noise / count, quantile(ranges, count, 0.5)
+        return 0, 0.0, 0.0, 0.0, spacing
+    return count, quantile(scatter, count, TYPICAL), noise / count, quantile(ranges, count, 0.5), spacing
 
 
 @njit(cache=True)

@@ -7,7 +7,7 @@ import numpy as np
 from rcnn_odom.geometry import FloatArray, advance, relative_step, wrap_angle
 from rcnn_odom.matching import yaw
 from rcnn_odom.matching.align import Table, align, build_table
-from rcnn_odom.matching.covariance import CORRELATED, Aligned, Uncertainty, hold_undetermined
+from rcnn_odom.matching.covariance import CORRELATED, Aligned, Uncertainty, hold_undetermined, weakest_direction
 from rcnn_odom.matching.local_map import LocalMap
 from rcnn_odom.matching.outline import Outline
 
@@ -31,15 +31,21 @@ WIDE_GATE, NARROW_GATE, GATE_ERRORS = 5.0, 1.0, 3.0
 so many of the recent errors of guesses."""
 GATE_TURN, GATE_FADES = 5.0, 0.9
 """Metres by which a radian of such an error counts, and by what the largest fades in each scan."""
-GOOD_SCORE, LEAST_SCORE = 0.55, 0.25
+GOOD_SCORE, LEAST_SCORE = 0.65, 0.25
 """Below the former other starts are tried as well; below the latter the scan does not fit the map."""
 ELSEWHERE, ELSEWHERE_TURN, NEARLY = 0.3, np.deg2rad(5.0), 0.85
 """Metres or radians from which on an alignment is another place, which is a rival with this part of the best
 score."""
 SUDDEN, SUDDEN_TURN = 0.5, np.deg2rad(20.0)
 """Metres or radians from the guess, from which on a motion is told as sudden."""
+WEAK_SHIFTS = (0.4, 0.8, 1.2, -0.4, -0.8)
+"""Metres along a direction that is hardly determined, where other starts are tried."""
+START_PENALTY, AWAY_PENALTY, TURN_PENALTY = 0.03, 0.03, 0.06
+"""Of the score: for another start than the guess, and for a metre and a radian from it."""
 CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.5
 """Metres where the gate stops, and by what it shrinks in each step."""
+SPARSE_GATE = 4.0
+"""Spacings of the beams by which the gate of a point opens with its range."""
 SAME_WALL = np.cos(np.deg2rad(45.0))
 """Cosine between two normals, below which a pair shows two different walls."""
 CALM = 0.04
@@ -53,7 +59,7 @@ WEAK_PRIOR = 5e-4 * np.eye(3)
 """Pull to the guess, beside a mean square of 1 of residuals' change over metres or radians."""
 POINT_ERROR = 0.01
 """Metres of a usual point's error, against which a measured guess is weighed."""
-TURNS = 3
+TURNS = 5
 """Peaks of the correlation of normals that are tried as turns."""
 FIRST_SHIFTS = (0.75, 1.5, 3.0, 4.5, -0.75, -1.5)
 """Metres ahead that are tried as well while the motion is not known yet."""
@@ -161,16 +167,22 @@ class Registration:
             table = self._table
             pose, score = align(
                 *(points, normals, table.entries, table.starts, table.centre),
-                *(start, guess, stiffness, gate, SETTINGS, found),
+                *(start, guess, stiffness, gate, SPARSE_GATE * scan.spacing, SETTINGS, found),
             )
             return Aligned.of(pose, score, found, scan, len(points))
 
         gate = min(WIDE_GATE, max(NARROW_GATE, GATE_ERRORS * self._guess_error))
         best = align_from(guess, gate)
-        if best.score >= GOOD_SCORE and self.knows_motion:
+        starts: list[FloatArray] = []
+        if best.score < GOOD_SCORE or not self.knows_motion:
+            starts = self._other_starts(scan, guess, gate)
+        elif (weak := weakest_direction(best)) is not None:
+            starts = [guess + shift * weak for shift in WEAK_SHIFTS]
+        if not starts:
             return best, False
-        found_all = [best, *(align_from(start, WIDE_GATE) for start in self._other_starts(scan, guess, gate))]
-        best = max(found_all, key=lambda aligned: aligned.score)
+        found_all = [best, *(align_from(start, WIDE_GATE) for start in starts)]
+        # What is nearer to the guess is preferred, so that a twin must fit better by more than chance.
+        best = max(found_all, key=lambda other: other.score - _penalty(other.pose, guess, other is not best))
         return best, any(_is_rival(other, best) for other in found_all)
 
     def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[FloatArray]:
@@ -219,6 +231,13 @@ def _thin(scan: Outline) -> tuple[FloatArray, FloatArray]:
         return scan.points, scan.normals
     chosen = np.arange(MOST_POINTS) * len(scan.points) // MOST_POINTS
     return scan.points[chosen], scan.normals[chosen]
+
+
+def _penalty(pose: FloatArray, guess: FloatArray, is_other: bool) -> float:
+    """Of a score, for what was reached from another start than the guess, or is far from it."""
+    away = float(np.hypot(pose[0] - guess[0], pose[1] - guess[1]))
+    start = START_PENALTY if is_other else 0.0
+    return start + AWAY_PENALTY * min(away, 3.0) + TURN_PENALTY * abs(float(wrap_angle(pose[2] - guess[2])))
 
 
 def _is_rival(other: Aligned, best: Aligned) -> bool:
