@@ -20,7 +20,7 @@ HARDLY = 0.05
 """The same below which other places along a direction are tried as well."""
 MAP_ERROR = 0.006
 """Metres by which a point of the map is off beside what scans say of themselves."""
-CORRELATED = 1.15
+CORRELATED = 1.0
 """Points whose errors are one: neighbours share the errors of their wall and of its line. Fitted."""
 DRIFTS = np.array([1.2, 0.5])
 """By how many times the variance of a match a map that moves along drifts in a metre, and in a radian. Fitted."""

@@ -59,8 +59,8 @@ WEAK_PRIOR = 5e-4 * np.eye(3)
 """Pull to the guess, beside a mean square of 1 of residuals' change over metres or radians."""
 POINT_ERROR = 0.01
 """Metres of a usual point's error, against which a measured guess is weighed."""
-TURNS = 5
-"""Peaks of the correlation of normals that are tried as turns."""
+TURNS, FEWEST_FOR_TURNS = 5, 30
+"""Peaks of the correlation of normals that are tried as turns, and points that tell of them."""
 FIRST_SHIFTS = (0.75, 1.5, 3.0, 4.5, -0.75, -1.5)
 """Metres ahead that are tried as well while the motion is not known yet."""
 FORGET_EVERY = 10
@@ -189,7 +189,8 @@ class Registration:
         """Poses where the laser may be as well: by the turn that the normals tell, or where it was."""
         starts = [guess] if gate < WIDE_GATE else []
         starts.append(self.pose)
-        for turn in yaw.turn_candidates(self._key_normals, scan.normals, TURNS):
+        turns = TURNS if len(scan.points) >= FEWEST_FOR_TURNS else 0
+        for turn in yaw.turn_candidates(self._key_normals, scan.normals, turns):
             heading = self._key_pose[2] + turn
             starts += [np.array([x, y, heading]) for x, y in (guess[:2], self.pose[:2])]
         if not self.knows_motion:
