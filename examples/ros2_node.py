@@ -152,9 +152,12 @@ def main() -> None:
 
     rclpy.init()
     node = rclpy.create_node("rcnn_odom")
-    OdometryNode(node)
-    with suppress(KeyboardInterrupt):
-        rclpy.spin(node)
+    try:
+        OdometryNode(node)
+        with suppress(KeyboardInterrupt):
+            rclpy.spin(node)
+    except InputError as error:
+        raise SystemExit(f"rcnn_odom: {error}") from None
 
 
 if __name__ == "__main__":

@@ -223,6 +223,12 @@ def test_the_node_takes_any_laser_and_sends_its_transform(example, monkeypatch):
     assert moved.transform.rotation.z == pytest.approx(np.sin(heading / 2))
 
 
+def test_what_a_user_can_mend_is_one_line(example, monkeypatch):
+    Ros(monkeypatch, model="none.onnx")
+    with pytest.raises(SystemExit, match=r"^rcnn_odom: none.onnx: no such file"):
+        example.main()
+
+
 def transform(x, y, quaternion):
     rotation = SimpleNamespace(**dict(zip("xyzw", quaternion, strict=True)))
     return SimpleNamespace(

@@ -9,6 +9,7 @@ import sys
 import time
 from dataclasses import replace
 from itertools import pairwise
+from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
@@ -521,6 +522,50 @@ def test_memory_is_constant_over_a_long_stream(model):
     assert used[1] - used[0] < 200_000, used
 
 
+@pytest.mark.slow
+def test_scan_matching_stays_as_small_and_fast_as_it_began(monkeypatch, tmp_path):
+    """20,000 scans, 80 rounds in a room with boxes: the map and what is kept must not grow."""
+    monkeypatch.setattr("rcnn_odom.deployment.run.MAP_SCANS", 100)
+    monkeypatch.setattr("rcnn_odom.deployment.run.LATENCIES", 100)
+    angles, rounds, rng = np.deg2rad(np.arange(-90.0, 91.0)), 250, np.random.default_rng(0)
+    clean = [_ranges_in_a_room(3.0, 2 * np.pi * number / rounds, angles) for number in range(rounds)]
+    odometer, seconds, megabytes = Odometer(), [], {}
+
+    def scans():
+        for number in range(20_000):
+            if number in (2000, 19_999):
+                pages = int(Path("/proc/self/statm").read_text().split()[1])
+                megabytes[number] = pages * os.sysconf("SC_PAGE_SIZE") / 1e6
+            noisy = clean[number % rounds] + rng.normal(0, 0.01, len(angles))
+            start = time.perf_counter()
+            yield Scan(noisy, angles, stamp=0.1 * number)
+            seconds.append(time.perf_counter() - start)
+
+    summary = run(odometer, ScanStream("long", scans()), "matcher", tmp_path / "out")
+    assert summary["degraded"] == {}
+    assert summary["path_m"] == pytest.approx(20_000 / rounds * 2 * np.pi * 3.0, rel=0.02)
+    assert megabytes[19_999] - megabytes[2000] < 8, megabytes
+    first, last = np.median(seconds[:1000]), np.median(seconds[-1000:])
+    assert last < 1.5 * first, (first, last)
+
+
+def _ranges_in_a_room(radius, turn, angles):
+    """Metres (P,) to the walls of a room of 16 by 12 m and of boxes in it, from a round about its middle."""
+    corners = [((-8, -6), (8, 6)), ((-1, -1), (1, 0.5)), ((5, 3), (6, 5)), ((-6, -5), (-5, -4))]
+    ways = np.stack([np.cos(angles + turn + np.pi / 2), np.sin(angles + turn + np.pi / 2)], axis=1)
+    place, nearest = radius * np.array([np.cos(turn), np.sin(turn)]), np.full(len(angles), np.inf)
+    for (left, low), (right, high) in corners:
+        for axis, value, start, end in (
+            *((0, x, low, high) for x in (left, right)),
+            *((1, y, left, right) for y in (low, high)),
+        ):
+            distance = (value - place[axis]) / np.where(ways[:, axis] == 0, 1e-12, ways[:, axis])
+            other = place[1 - axis] + distance * ways[:, 1 - axis]
+            hits = (distance > 0) & (start <= other) & (other <= end)
+            nearest = np.where(hits, np.minimum(nearest, distance), nearest)
+    return nearest
+
+
 def test_the_map_shows_walls_where_they_are(tmp_path):
     """With true motions the scans of a square room lie on each other."""
     from rcnn_odom.evaluation.figures import map_figure
@@ -715,8 +760,9 @@ def test_the_wheels_of_a_log_or_none(asked, monkeypatch, tmp_path, capsys):
         assert main(["run", "robot.log", "--wheels", "--out", str(tmp_path / f"out{status}")]) == status
     assert len(steps_in(tmp_path / "out0")) == 5
     assert asked.made == (True, True)
-    assert "robot.log: has no odometry of the robot with its scans; leave --wheels out" in (
-        capsys.readouterr().err
+    assert (
+        "robot.log: has no odometry of the robot with its scans; leave --wheels out; of a bag, name its "
+        "topic: --odom-topic" in capsys.readouterr().err
     )
 
 
@@ -776,7 +822,38 @@ def test_an_option_of_bags_for_another_format(asked, tmp_path, capsys, option):
 def test_ranges_without_angles_are_refused(asked, monkeypatch, capsys):
     monkeypatch.setattr(sys, "stdin", iter([json.dumps({"ranges": [5.0] * 181})] * 2))
     assert main(["run", "--live"]) == 1
-    assert "standard input: scan 1 has no angles; give angle_min and" in capsys.readouterr().err
+    assert "standard input: its first scan has no angles; give angle_min and" in capsys.readouterr().err
+
+
+def test_one_line_without_angles_ends_no_run(asked, monkeypatch, capsys):
+    good = {"ranges": [5.0] * 181, "angle_min": -1.5708, "angle_increment": 0.0174533}
+    rows = [good, good, {"ranges": [5.0] * 181}, good]
+    monkeypatch.setattr(sys, "stdin", iter(map(json.dumps, rows)))
+    assert main(["run", "--live"]) == 0
+    printed = capsys.readouterr()
+    assert len(printed.out.splitlines()) == 3
+    assert "skipped: 1 scans without angles" in printed.err
+
+
+@pytest.mark.parametrize(("deskew", "last"), [("on", 0.1 * 180 / 360), ("auto", None)])
+def test_the_time_of_a_turn_counts_where_a_user_says_so(asked, monkeypatch, deskew, last):
+    """Depth cameras, which see all at once, write it as well."""
+    seen, register = [], Asked.register
+    monkeypatch.setattr(
+        Asked, "register", lambda self, scan, *more: seen.append(scan.times) or register(self, scan)
+    )
+    row = {"ranges": [5.0] * 181, "angle_min": -np.pi / 2, "angle_increment": np.pi / 180, "scan_time": 0.1}
+    monkeypatch.setattr(sys, "stdin", iter([json.dumps(row)] * 3))
+    assert main(["run", "--live", "--deskew", deskew]) == 0
+    assert len(seen) == 2
+    assert seen[0] is None if last is None else seen[0][-1] == pytest.approx(last)
+
+
+def test_the_name_that_the_matcher_had(capsys):
+    assert main(["run", "a.bag", "--out", "x", "--model", "icp"]) == 1
+    assert capsys.readouterr().err == (
+        "rcnn-odom: error: --model icp has become --model matcher, the default; leave --model out\n"
+    )
 
 
 LINE = np.deg2rad(np.arange(-80.0, 81.0))

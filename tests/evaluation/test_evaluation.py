@@ -312,13 +312,15 @@ def test_the_report_of_whole_steps_has_a_row_of_two_numbers_and_no_mean_motion(t
     estimated = {"05": Steps.with_unknown_covariance(steps)}
     data = {"name": "kitti", "lengths": [10.0], "apply": "end"}
     figures = {}
-    report = report_drives("icp", estimated, None, LATENCY, [sequence], data, tmp_path, figures.__setitem__)
+    report = report_drives(
+        "matcher", estimated, None, LATENCY, [sequence], data, tmp_path, figures.__setitem__
+    )
     assert report["test"]["drift"] == pytest.approx(0, abs=1e-9)
-    assert list(report["baselines"]) == ["held_motion", "icp_two_numbers"]
+    assert list(report["baselines"]) == ["held_motion", "matcher_two_numbers"]
     assert {"numpy", "scipy", "numba"} <= set(report["versions"])
     assert "coverage" not in report
-    assert table({"icp": report["test"], **report["baselines"]}) in caplog.text
-    assert metrics_table({"icp": report["test"], **report["baselines"]}) in caplog.text
+    assert table({"matcher": report["test"], **report["baselines"]}) in caplog.text
+    assert metrics_table({"matcher": report["test"], **report["baselines"]}) in caplog.text
     camera = read_kitti(tmp_path / "trajectories" / "05.txt")
     np.testing.assert_allclose(camera[:, [2, 0], 3] * [1, -1], np.array(SIDEWAYS)[:, :2], atol=1e-9)
     truth, methods = read_motions(tmp_path / "trajectories" / "05_motions.csv")
@@ -343,7 +345,7 @@ def test_wheel_odometry_is_not_cut_to_two_numbers_either(tmp_path):
     sequence = replace(sequence, wheel_odometry=moved)
     data = {"name": "carmen", "lengths": [10.0], "apply": "end"}
     steps = {"05": held_motion().estimate(sequence)}
-    report = report_drives("icp", steps, None, LATENCY, [sequence], data, tmp_path)
+    report = report_drives("matcher", steps, None, LATENCY, [sequence], data, tmp_path)
     assert report["baselines"]["wheel_odometry"]["drift"] == pytest.approx(0, abs=1e-9)
 
 

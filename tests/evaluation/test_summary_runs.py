@@ -181,15 +181,15 @@ def test_a_training_without_a_seed_is_damaged(tmp_path):
 
 def test_evaluations_are_no_runs(tmp_path):
     finish_run(tmp_path / "a", ["seed=0"], DRIFTS)
-    finish_run(tmp_path / "b" / "icp", ["run=a"], DRIFTS, seed=None, variant="icp")
-    forget_seed(tmp_path / "b" / "icp")  # scan matching has none
+    finish_run(tmp_path / "b" / "matcher", ["run=a"], DRIFTS, seed=None, variant="matcher")
+    forget_seed(tmp_path / "b" / "matcher")  # scan matching has none
     other = {"data.test": ["00"]}
-    finish_run(tmp_path / "b" / "other", ["run=a"], {"05": 0.1}, other, seed=None, variant="icp")
+    finish_run(tmp_path / "b" / "other", ["run=a"], {"05": 0.1}, other, seed=None, variant="matcher")
     begin_run(tmp_path / "b" / "stopped", ["run=a"])
     (tmp_path / "b" / "stopped" / ".hydra" / "hydra.yaml").write_text("hydra: {job: {name: evaluate}}")
     sweep = read_sweep(tmp_path)
     assert [run.name for run in sweep.runs] == ["a"]
-    assert [run.name for run in sweep.evaluations] == ["b/icp"]
+    assert [run.name for run in sweep.evaluations] == ["b/matcher"]
     assert sweep.left_out == ["b/other"]
     assert list(load_runs(tmp_path)["run"]) == ["a"]
 

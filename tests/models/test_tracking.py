@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 
 from odometry import ANGLES, random_scans
-from rcnn_odom.geometry import FORWARD_CAMERA, Step, compose
+from rcnn_odom.geometry import FORWARD_CAMERA, Step, compose, planar_to_poses, relative_steps
 from rcnn_odom.models.contract import Description, Registered
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import PairTracker
-from rcnn_odom.models.tracking import Kind, Tracking, estimate_by_tracking
+from rcnn_odom.models.tracking import SWINGS, Kind, Tracking, estimate_by_tracking
 from rcnn_odom.recordings.beams import PATIENCE
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
@@ -119,6 +119,36 @@ def test_scans_of_another_frame_are_passed_over_until_it_is_the_lasers():
         *[(Kind.ESTIMATED, "")] * 3,
     ]
     assert diary.calls.count("reset") == 2
+
+
+@pytest.mark.parametrize(
+    ("there", "told"),
+    [
+        ((0.5, 0.0, np.pi), True),  # one laser looks ahead, one back
+        ((0.3, 0.4, 0.0), True),
+        ((0.0, 0.0, 0.3), True),
+        ((0.05, 0.0, 0.1), False),  # a robot that shakes
+    ],
+)
+def test_two_lasers_on_one_topic_are_told(there, told):
+    """Under one frame or none: every second scan is taken from another place, while both move on."""
+    diary = Diary()
+    tracking, on_robot = Tracking(diary), planar_to_poses([(0, 0, 0), there])
+    robot = compose([(0.02, 0.0, 0.01)] * 11)
+    answers = relative_steps(robot @ on_robot[np.arange(12) % 2])
+    kinds = []
+    for n in range(12):
+        diary.answer = Registered(Step(*answers[max(n - 1, 0)].tolist()))
+        kinds += [note.split(":")[0] for note in tracking.step(scan_at(0.1 * n, 5 + 0.1 * n)).notes]
+    assert kinds == ["to and fro"] * (11 - SWINGS if told else 0)
+
+
+def test_steps_that_go_on_or_turn_back_once_are_not_to_and_fro():
+    diary = Diary()
+    tracking = Tracking(diary)
+    for n, x in enumerate([0.0, 0.5, 0.5, -0.5, -0.5, 0.5, 0.1, 0.05, -0.05, 0.05, -0.3, 0.1]):
+        diary.answer = Registered(Step(x, 0.0, 0.0))
+        assert tracking.step(scan_at(0.1 * n, 5 + 0.1 * n)).notes == ()
 
 
 def test_until_something_is_seen_every_scan_is_the_first():

@@ -13,9 +13,10 @@ from conftest import SHARED
 from data.make_carmen import MAX_READING, PACKINGS, behind, make_carmen, wheel_odometry, write_log
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import drift
-from rcnn_odom.geometry import FORWARD_CAMERA, change_frame, planar_to_poses, poses_to_planar
+from rcnn_odom.geometry import FORWARD_CAMERA, change_frame, compose, planar_to_poses, poses_to_planar
 from rcnn_odom.models.encoding import Sensor, encode
-from rcnn_odom.models.icp import ICP
+from rcnn_odom.models.matcher import MatcherTracker
+from rcnn_odom.models.tracking import Kind, Tracking
 from rcnn_odom.recordings import carmen
 from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.recordings.carmen_log import params
@@ -897,19 +898,16 @@ def test_cases_that_are_refused(cases: Path, name: str, match: str) -> None:
 
 
 @pytest.mark.parametrize(
-    ("name", "sensor", "most"),
-    [
-        ("robotlaser_neg_res", Sensor(1.0, 180.0, 40.0), 0.11),
-        ("flaser_541_param", Sensor(0.5, 270.0, 40.0), 0.085),
-    ],
+    ("name", "most"),
+    [("robotlaser_neg_res", 0.11), ("flaser_541_param", 0.085)],
 )
-def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, sensor: Sensor, most: float) -> None:
+def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, most: float) -> None:
     log = carmen.load(name, root=cases)
-    scans = np.stack([sensor.encode(log.read_scan(frame)) for frame in range(len(log))])
-    drive = Drive(name, "", scans, log.poses, log.stamps, FORWARD_CAMERA)
-    icp = ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, sensor)
-    found = change_frame(icp.estimate(drive).poses(), FORWARD_CAMERA)
-    assert icp.failures == {name: 0}
+    drive = Drive.unencoded(log)
+    tracking = Tracking(MatcherTracker())
+    tracked = [tracking.step(scan) for scan in drive.raw_scans()][1:]
+    assert {each.kind for each in tracked} == {Kind.ESTIMATED}
+    found = change_frame(compose([each.step.array() for each in tracked]), FORWARD_CAMERA)
     score = drift(drive.camera_poses, found, planar=True, lengths=[1.0, 2.0, 5.0, 10.0])
     assert score.t_err < most
     for frame, scan in enumerate(carmen.stream(cases / f"{name}.log.gz").scans):

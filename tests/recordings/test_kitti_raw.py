@@ -451,7 +451,7 @@ def test_configuration(root: Path, configure) -> None:
             plain(configure(*options))
     settings = plain(configure(*where, *drives, "data.ring=1"))
     assert "ring 1 of" in open_recording(settings["data"]["reader"])(NAME).notes[-1]
-    metrics = evaluate(configure("model=icp", *where, *drives, "data.lengths=[2,4]", name="evaluate"))
+    metrics = evaluate(configure("model=matcher", *where, *drives, "data.lengths=[2,4]", name="evaluate"))
     assert metrics["data"] == "kitti_raw"
     assert metrics["test"]["drift"] < 0.03
     assert any(root.rglob(METRICS))

@@ -11,9 +11,9 @@ from data.make_kitti import LEVEL_RING, make_kitti
 from data.point_orders import PERMUTED, RINGED, THINNED, thin
 from rcnn_odom.errors import InputError
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.icp import ICP
+from rcnn_odom.models.matcher import MatcherTracker
+from rcnn_odom.models.tracking import Kind, Tracking
 from rcnn_odom.recordings import kitti
-from rcnn_odom.recordings.cache import encode_recordings
 from rcnn_odom.recordings.velodyne import (
     are_thinned,
     find_level_beam,
@@ -440,11 +440,10 @@ def test_the_path_of_a_real_drive_in_any_order(tmp_path: Path, order: str) -> No
             found, wanted = (beams(one.read_scan(frame)) for one in (recording, original))
             for values, expected in zip(found, wanted, strict=True):
                 np.testing.assert_array_equal(np.sort(values), np.sort(expected))
-    [drive] = encode_recordings([recording], Sensor(), tmp_path, workers=1)
-    model = ICP({"beams": 450, "max_iterations": 30, "max_distance": 5.0}, Sensor())
-    steps = model.estimate(drive).values
-    length = np.hypot(steps[:, 0], steps[:, 1]).sum()
+    tracking = Tracking(MatcherTracker(deskew=False))
+    tracked = [tracking.step(recording.read_scan(frame)) for frame in range(len(recording))][1:]
+    length = sum(np.hypot(each.step.x, each.step.y) for each in tracked)
     print(f"{order}: {length:.2f} m, {recording.notes[1:]}")
     assert any("thinned to a grid" in note for note in recording.notes) == (order in THINNED)
-    assert model.failures == {"00": 0}
+    assert {each.kind for each in tracked} == {Kind.ESTIMATED}
     assert 47 < length < 48.5

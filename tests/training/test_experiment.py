@@ -304,8 +304,9 @@ def test_training_in_bf16_learns_a_drive_by_heart(configure, kitti, augmented):
 
 
 def test_a_model_that_does_not_train_is_refused(configure, kitti):
-    settings = plain(configure("model=cnn_reg", *kitti)) | {"model": {"variant": "icp"}}
-    with pytest.raises(InputError, match=r"^model=icp has nothing to train; score it: .*model=icp data="):
+    settings = plain(configure("model=cnn_reg", *kitti)) | {"model": {"variant": "matcher"}}
+    says = r"^model=matcher has nothing to train; score it: .*model=matcher data="
+    with pytest.raises(InputError, match=says):
         stages.train(settings)
 
 

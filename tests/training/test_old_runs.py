@@ -102,7 +102,8 @@ def test_its_onnx_file_is_refused_in_a_line(tmp_path, capsys):
     }
     helper.set_model_props(model, {"rcnn_odom": json.dumps(metadata)})
     onnx.save(model, tmp_path / "old.onnx")
-    assert main(["run", str(tmp_path / "old.onnx"), str(tmp_path), "--out", str(tmp_path / "out")]) == 1
+    old = str(tmp_path / "old.onnx")
+    assert main(["run", str(tmp_path), "--model", old, "--out", str(tmp_path / "out")]) == 1
     printed = capsys.readouterr().err
     assert "old.onnx: written by an older version; export the checkpoint again" in printed
     assert printed.count("\n") == 1

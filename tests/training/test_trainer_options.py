@@ -80,13 +80,13 @@ def test_what_has_no_meaning_is_refused_before_anything_is_encoded(
     assert not (tmp_path / "outputs").exists()
     if "devices" not in option:
         with pytest.raises(InputError, match=r"^trainer\."):
-            evaluate(configure("model=icp", *kitti, option, name="evaluate"))
+            evaluate(configure("model=matcher", *kitti, option, name="evaluate"))
 
 
 @pytest.mark.parametrize("option", ["max_time=00:00:01:00", "fast_dev_run=true", "limit_train_batches=2"])
 def test_options_of_training_are_refused_where_nothing_is_trained(configure, kitti, option):
     with pytest.raises(InputError, match="nothing is trained; leave it out"):
-        evaluate(configure("model=icp", *kitti, f"+trainer.{option}", name="evaluate"))
+        evaluate(configure("model=matcher", *kitti, f"+trainer.{option}", name="evaluate"))
 
 
 def test_every_refusal_says_what_to_do():

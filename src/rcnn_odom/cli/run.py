@@ -28,7 +28,7 @@ if TYPE_CHECKING:
     from rcnn_odom.models.contract import ScanTracker
     from rcnn_odom.recordings.stream import ScanStream
 
-MATCHER = "matcher"
+MATCHER, OLD_NAME = "matcher", "icp"
 FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg", "base", "odom_topic")
 """Options that are a format's own."""
 FILE_OPTIONS = (*FORMAT_OPTIONS[1:], "wheels")
@@ -76,7 +76,8 @@ def _add_poses_and_priors(parser: argparse.ArgumentParser) -> None:
         "--laser-pose",
         type=laser_pose,
         metavar="X Y HEADING",
-        help="where the laser sits on the robot, in metres, metres and degrees: gives the robot's poses",
+        help="where the laser sits on the robot, upright, in metres, metres and degrees: gives the robot's "
+        "poses",
     )
     add("--base", metavar="FRAME", help="the robot's frame, base_link: its poses, by a bag's /tf_static")
     add("--wheels", action="store_true", help="the odometry in a log helps the matcher")
@@ -128,9 +129,11 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
     """Refuses what does not go together.
 
     Raises:
-        InputError: the model comes before the recording, as it did in earlier versions.
+        InputError: the model comes before the recording, or has the name, that it had in earlier versions.
     """
     _refuse_old_order(arguments)
+    if arguments.model == OLD_NAME:
+        raise InputError(f"--model {OLD_NAME} has become --model {MATCHER}, the default; leave --model out")
     if len(arguments.paths) != (0 if arguments.live else 1):
         parser.error("give one INPUT or --live")
     if not arguments.live and arguments.out is None:
@@ -192,17 +195,25 @@ def _open(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> "Sc
     from rcnn_odom.recordings.stream import thin
 
     if arguments.live:
-        return thin(json_lines.stream_lines(_read_live(), topic=arguments.topic), arguments.every or 1)
+        stream = _assume_turns(arguments, json_lines.stream_lines(_read_live(), topic=arguments.topic))
+        return thin(stream, arguments.every or 1)
     path, every = split_thinning(arguments.paths[0])
     if every and arguments.every:
         parser.error(f"--every and [::{every}] say the same; give one of them")
     options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
     if arguments.odom_topic:
         options["laser_pose"] = arguments.laser_pose  # by which the odometry is carried over to the laser
-    stream = open_stream(path, options)
+    stream = _assume_turns(arguments, open_stream(path, options))
     if arguments.wheels or arguments.odom_topic:
         stream = _need_wheels(stream, "--wheels" if arguments.wheels else "--odom-topic")
     return thin(stream, every or arguments.every or 1)
+
+
+def _assume_turns(arguments: argparse.Namespace, stream: "ScanStream") -> "ScanStream":
+    """With ``--deskew on`` also beams have times of which only the time of a turn is known."""
+    from rcnn_odom.recordings.laser_scan import assume_even_turn
+
+    return replace(stream, scans=map(assume_even_turn, stream.scans)) if arguments.deskew == "on" else stream
 
 
 def _need_wheels(stream: "ScanStream", option: str) -> "ScanStream":
@@ -213,7 +224,10 @@ def _need_wheels(stream: "ScanStream", option: str) -> "ScanStream":
     """
     first = list(islice(stream.scans, FIRST_SCANS))
     if first and not any(scan.wheel_pose for scan in first):
-        raise InputError(f"{stream.name}: has no odometry of the robot with its scans; leave {option} out")
+        advice = f"leave {option} out" + (
+            "; of a bag, name its topic: --odom-topic" if option == "--wheels" else ""
+        )
+        raise InputError(f"{stream.name}: has no odometry of the robot with its scans; {advice}")
     return replace(stream, scans=chain(first, stream.scans))
 
 

@@ -76,6 +76,8 @@ def run(
         bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
         try:
             for scan in stack.enter_context(closing(bar)):
+                if statistics.passes_over(scan):
+                    continue
                 pose = statistics.step(scan)
                 if folder:
                     folder.add(pose)
@@ -118,15 +120,26 @@ class Statistics:
         self.milliseconds = EvenSample[float](LATENCIES)
         self.sample = EvenSample[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
 
+    def passes_over(self, scan: Scan) -> bool:
+        """Whether nothing says where the beams of a scan lie, among others where something does; counts it.
+
+        Raises:
+            InputError: nothing says it of the first one.
+        """
+        if scan.bearings is not None or self.odometer.sensor:
+            return False
+        if not self.scans:
+            raise InputError(f"{self.stream.name}: its first scan has no angles; {GIVE_ANGLES}")
+        self.stream.skipped["scans without angles"] += 1
+        return True
+
     def step(self, scan: Scan) -> Pose:
         """One scan through the odometer, timed and counted.
 
         Raises:
-            InputError: the laser is another than a network's, for good; or nothing says where its beams lie.
+            InputError: the laser is another than a network's, for good.
         """
         odometer, check = self.odometer, self.odometer.beam_check
-        if scan.bearings is None and not odometer.sensor:
-            raise InputError(f"{self.stream.name}: scan {self.scans + 1} has no angles; {GIVE_ANGLES}")
         start = time.perf_counter()
         pose = odometer.step(scan if self.stream.has_clock else replace(scan, stamp=None))
         milliseconds = 1e3 * (time.perf_counter() - start)

@@ -3,27 +3,28 @@
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.matching.outline import Outline
 
 LEAST_NORMAL_NOISE = 0.01
-"""Radians by which normals are off at least."""
+"""Radians: the least standard deviation of a normal."""
 LEAST_INFORMATION = 0.004
-"""Mean square of the residuals' change over metres along a direction or radians: where there is less, as along
-a bare corridor, the guess counts more than the match."""
+"""Mean information of the pairs on a direction: the mean square of the residuals' change over metres or
+radians. Where there is less, as along a bare corridor, the guess counts more than the match."""
 WEAK_INFORMATION = 0.03
-"""The same where a match counts by half of what it says of itself: the few points that determine such a direction
-err together."""
+"""The same, where the information of a match counts by half: the few points that determine such a direction
+have errors in common."""
 HARDLY = 0.05
-"""The same below which other places along a direction are tried as well."""
+"""The same, below which other places along a direction are tried as well."""
 MAP_ERROR = 0.006
-"""Metres by which a point of the map is off beside what scans say of themselves."""
+"""Metres: the error of a point of the map in addition to the scatter of a scan."""
 CORRELATED = 1.0
-"""Points whose errors are one: neighbours share the errors of their wall and of its line. Fitted."""
+"""Points that share one error, as neighbours on a wall share those of the wall and its line. Fitted."""
 DRIFTS = np.array([1.2, 0.5])
-"""By how many times the variance of a match a map that moves along drifts in a metre, and in a radian. Fitted."""
+"""Variance by which a map that moves along drifts per metre and per radian, over the variance of a match.
+Fitted."""
 
 
 class Aligned(NamedTuple):
@@ -32,30 +33,34 @@ class Aligned(NamedTuple):
     Attributes:
         pose: (3,) in the map's frame.
         score: see :func:`rcnn_odom.matching.align.align`.
+        fit: the same of the points on lines, if there are enough of them.
         information: (3, 3) on x, y and heading in the map's frame, a mean over the pairs, without what errors
             of normals feign.
-        weight: sum of the pairs' weights. Points that were left out count too, by the square root: they have
-            smoothed the lines of the others.
-        square: square metres of the error of a point: between the mean square of the residuals, too small
-            since lines smooth, and the scatter of the returns about their lines, to which all that is rough
-            adds.
+        weight: sum of the pairs' weights, multiplied by the square root of the scan's points over those that
+            were aligned: points that were left out have helped to fit the lines.
+        square: square metres, the variance of a point: the geometric mean of the mean square of the
+            residuals, which is too small since lines smooth, and of the scatter of the returns about their
+            lines, which is too large where surfaces are rough.
         share: part of the points with a partner.
     """
 
     pose: FloatArray
     score: float
+    fit: float
     information: FloatArray
     weight: float
     square: float
     share: float
 
     @classmethod
-    def of(cls, pose: FloatArray, score: float, found: FloatArray, scan: Outline, aligned: int) -> "Aligned":
-        """Of what :func:`rcnn_odom.matching.align.align` fills in, for so many points of a scan."""
+    def of(
+        cls, pose: FloatArray, score: float, fit: float, found: FloatArray, scan: Outline, aligned: int
+    ) -> "Aligned":
+        """Of what :func:`rcnn_odom.matching.align.align` gives for ``aligned`` points of a scan."""
         information = found[:3] - max(scan.normal_noise, LEAST_NORMAL_NOISE**2) * found[3:6]
         square = float(np.sqrt(found[6, 1] * scan.scatter)) + MAP_ERROR**2
         weight = float(found[6, 0]) * float(np.sqrt(len(scan.points) / aligned))
-        return cls(pose, score, information, weight, square, float(found[6, 2]))
+        return cls(pose, score, fit, information, weight, square, float(found[6, 2]))
 
 
 def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -64,9 +69,14 @@ def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, 
     Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016; but
     gradually, so that nothing jumps where a direction is just determined.
 
+    Args:
+        aligned: the match.
+        guess: (3,) pose in the map's frame.
+
     Returns:
-        The pose (3,); the directions (3, K) along which mostly the guess stands; and the match's information
-        (3, 3) on the pose in the map's frame.
+        The pose (3,); the directions (3, K) along which the guess counts more than the match; and the
+        information (3, 3) of the match on the pose, inverse square metres and radians. All of them in the
+        map's frame.
     """
     pose, directions, share, information = _hold(
         aligned.pose, guess, aligned.information, aligned.weight / (CORRELATED * aligned.square)
@@ -75,7 +85,10 @@ def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, 
 
 
 def weakest_direction(aligned: Aligned) -> FloatArray | None:
-    """The direction (3,), of unit length in the plane, that is hardly determined; None where all are."""
+    """The direction (3,) of motion, a metre long, that is hardly determined.
+
+    None where all are determined, or where it is the heading that is not.
+    """
     values, vectors = np.linalg.eigh(aligned.information)
     along = vectors[:, 0]
     if values[0] > HARDLY or abs(along[2]) > 0.7:
@@ -84,8 +97,9 @@ def weakest_direction(aligned: Aligned) -> FloatArray | None:
     return direction
 
 
-@njit(cache=True)
+@compiled
 def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
+    """The held pose, the directions (3, 3), the share of the guess in each, and the match's information."""
     strengths, directions = np.linalg.eigh(information)
     strengths = np.maximum(strengths, 0.0)
     share = LEAST_INFORMATION**2 / (LEAST_INFORMATION**2 + strengths**2)
@@ -97,11 +111,11 @@ def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
 
 
 class Uncertainty:
-    """How wrong the pose in the map and the last step are, carried along with the matches (a Kalman filter).
+    """Covariances of the pose in the map and of the last step, by a Kalman filter.
 
-    The map-relative error of a pose, e, is that of the guess where the scan says nothing, and that of the match
-    where it says enough: e' = (1 - G) (F e + w) + G m, with the guess's error w, the match's error m, the
-    gain G, and F, by which an error of heading moves what lies ahead.
+    The error e of a pose in the map becomes e' = (1 - G) (F e + w) + G m, with the error w of the guess, the
+    error m of the match, the gain G, which is 0 where the scan says nothing and 1 where it says enough, and
+    F, by which an error of heading moves what lies ahead. The error of the step is e' - F e.
 
     Attributes:
         pose: (3, 3) covariance of the last pose in the map's frame.
@@ -121,14 +135,14 @@ class Uncertainty:
             information: (3, 3) of the match on the later pose, in the map's frame; 0 where there is none.
 
         Returns:
-            Covariances (3, 3) of the step, in the frame of the earlier pose, and of the part of its error that
-            the next step takes back, in the frame of the later pose.
+            Covariances (3, 3) of the step, in the frame of the earlier pose, and of the part of its error
+            that the next step takes back, G m, in the frame of the later pose.
         """
         self.pose, step, noise = _update(self.pose, before, after, guess, information, DRIFTS)
         return step, noise
 
 
-@njit(cache=True)
+@compiled
 def _update(pose, before, after, guess, information, drifts):  # type: ignore[no-untyped-def]
     x, y = after[0] - before[0], after[1] - before[1]
     distance, turn = np.sqrt(x * x + y * y), abs(after[2] - before[2])

@@ -1,29 +1,32 @@
 """Scans that take time: points brought to where a laser that moved meanwhile would have seen them at once."""
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 LONGEST = 1.0
-"""Seconds: beams farther from the stamp than that are not believed."""
+"""Seconds from the stamp, beyond which times are not believed; such beams stay as they are."""
 
 
 def deskew(ranges: FloatArray, bearings: FloatArray, times: FloatArray, velocity: FloatArray) -> FloatArray:
-    """Ranges and bearings (2, P) as seen from where the laser was at the scan's stamp.
+    """Ranges and bearings as seen from where the laser was at the scan's stamp.
 
     Args:
         ranges: (P,) metres.
         bearings: (P,) radians.
         times: (P,) seconds after the stamp.
         velocity: (3,) metres and radians a second, of the laser in its own frame, the same all the time.
+
+    Returns:
+        (2, P) metres and radians; beams without a return are unchanged.
     """
     moved = np.empty((2, len(ranges)))
     _deskew(ranges, bearings, times, velocity, moved)
     return moved
 
 
-@njit(cache=True)
+@compiled
 def _deskew(ranges, bearings, times, velocity, moved):  # type: ignore[no-untyped-def]
     for i in range(len(ranges)):
         if not (0 < ranges[i] < np.inf and abs(times[i]) <= LONGEST):

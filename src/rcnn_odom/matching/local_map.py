@@ -1,25 +1,24 @@
-"""What the laser has seen lately: voxels, each with the mean point and the mean normal of what fell into it."""
+"""What the laser has seen lately: voxels, each with the mean point and normal of what fell into it."""
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 SLOTS = 1 << 16
-"""Of the hash table; a power of two."""
+"""Places in the hash table, a power of two."""
 MOST_CELLS = 20_000
-"""A bound that no usual map comes near: the table stays mostly empty."""
-X, Y, NX, NY, WEIGHT, SEEN = range(6)
+"""Beyond them nothing is added until the map has forgotten something. Usual maps are far smaller."""
 
 
 class LocalMap:
-    """Points with normals in a fixed frame, averaged in voxels and forgotten by how far the laser has come.
+    """Points with normals in a fixed frame, averaged in voxels, and forgotten after some metres of the way.
 
     A voxel has a cell for each of four directions of normals, so that both sides of a thin wall stay apart.
 
     Args:
         voxel: metres.
-        most_weight: scans after which a cell's mean only follows new ones slowly.
+        most_weight: scans after which a cell's mean follows new points by a constant share.
     """
 
     def __init__(self, voxel: float, most_weight: float) -> None:
@@ -35,7 +34,13 @@ class LocalMap:
         self.count = 0
 
     def add(self, points: FloatArray, normals: FloatArray, pose: FloatArray, travelled: float) -> None:
-        """Adds what was seen from a pose (x, y, heading) after so many metres."""
+        """Adds what was seen from a pose.
+
+        Args:
+            points, normals: (P, 2) metres and unit vectors in the laser's frame.
+            pose: (3,) metres and radians in the map's frame.
+            travelled: metres of the way to there.
+        """
         self.count = _add(
             points,
             normals,
@@ -50,15 +55,22 @@ class LocalMap:
         )
 
     def present(self) -> FloatArray:
-        """Its cells (C, 6): x, y, normal, weight, and the metres after which each was seen last."""
+        """Its cells (C, 6): x and y in metres, normal, weight, and the metres of the way when last seen."""
         return self.cells[: self.count]
 
     def forget(self, before: float) -> None:
-        """Removes what was last seen before the laser had come so many metres."""
+        """Removes what was last seen before so many metres of the way."""
         self.count = _forget(before, self.cells, self.keys, self.slots, self.count)
 
 
-@njit(cache=True)
+@compiled
+def _key(column, row, nx, ny):  # type: ignore[no-untyped-def]
+    """The number of a cell: 29 bits for each index of the voxel, and two for the direction of the normal."""
+    side = (nx <= 0) if abs(nx) > abs(ny) else 2 + (ny <= 0)
+    return (((column & 0x1FFFFFFF) << 29 | (row & 0x1FFFFFFF)) << 2) | side
+
+
+@compiled
 def _slot(key, slots, keys):  # type: ignore[no-untyped-def]
     """Where a key is in the table, or the free slot where it belongs."""
     mixed = key * np.int64(-7046029254386353131)
@@ -68,20 +80,18 @@ def _slot(key, slots, keys):  # type: ignore[no-untyped-def]
     return place
 
 
-@njit(cache=True)
-def _add(points, normals, pose, travelled, voxel, most, cells, keys, slots, count):  # type: ignore[no-untyped-def]
+@compiled
+def _add(  # type: ignore[no-untyped-def]
+    points, normals, pose, travelled, voxel, most, cells, keys, slots, count
+):
+    """Adds points to the cells; returns the new number of cells."""
     cos, sin = np.cos(pose[2]), np.sin(pose[2])
     for i in range(len(points)):
         x = pose[0] + cos * points[i, 0] - sin * points[i, 1]
         y = pose[1] + sin * points[i, 0] + cos * points[i, 1]
         nx = cos * normals[i, 0] - sin * normals[i, 1]
         ny = sin * normals[i, 0] + cos * normals[i, 1]
-        if abs(nx) > abs(ny):
-            side = 0 if nx > 0 else 1
-        else:
-            side = 2 if ny > 0 else 3
-        column, row = np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel))
-        key = (((column & 0x1FFFFFFF) << 29 | (row & 0x1FFFFFFF)) << 2) | side
+        key = _key(np.int64(np.floor(x / voxel)), np.int64(np.floor(y / voxel)), nx, ny)
         place = _slot(key, slots, keys)
         cell = slots[place]
         if cell < 0:
@@ -107,8 +117,9 @@ def _add(points, normals, pose, travelled, voxel, most, cells, keys, slots, coun
     return count
 
 
-@njit(cache=True)
+@compiled
 def _forget(before, cells, keys, slots, count):  # type: ignore[no-untyped-def]
+    """Moves the cells that stay to the front, and builds the hash table anew; returns their number."""
     slots[:] = -1
     kept = 0
     for cell in range(count):

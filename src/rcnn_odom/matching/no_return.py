@@ -1,16 +1,17 @@
 """Which readings mean that nothing came back: many lasers write one and the same large number."""
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 TOP = 0.994
-"""Readings from this part of the largest one on may be the number: some lasers vary it by half a percent."""
+"""Part of the largest reading from which on readings may be that number: some lasers vary it by half a
+percent."""
 BELOW = 0.97
-"""Down to this part of the largest lie the readings that it is compared with."""
+"""Part of the largest reading down to which readings are compared with those at the top."""
 FEWEST, TIMES = 5, 3
-"""So many readings at the top, and so many times those just below, are no walls."""
+"""Readings at the top are no walls if there are so many, and so many times as many as just below."""
 LEAST = 3.5
 """Metres: no laser's maximum is smaller, and in a small round room all readings are the largest."""
 
@@ -26,8 +27,9 @@ class NoReturn:
         return min(farthest, _learn(ranges, self._state))
 
 
-@njit(cache=True)
+@compiled
 def _learn(ranges, state):  # type: ignore[no-untyped-def]
+    """Counts the readings of a scan; returns the limit in metres, inf if there is none yet."""
     largest = state[0]
     for i in range(len(ranges)):
         if ranges[i] > largest and ranges[i] < np.inf:

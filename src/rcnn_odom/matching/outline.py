@@ -1,30 +1,38 @@
-"""A scan as the matcher sees it: points, each with the normal of the line it lies on."""
+"""A scan as the matcher sees it: points, each with the normal of the line on which it lies."""
 
 from dataclasses import dataclass
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.matching.numeric import quantile
 
 LINE_REACH, LINE_GAP = 0.2, 0.2
-"""Metres from a point to the neighbours that its line is fitted to, and between two of these: more is a jump
-from one thing to another behind it."""
+"""Metres from a point to the neighbours to which its line is fitted, and between two neighbours: a wider gap
+is a jump from one thing to another behind it."""
 SPARSE_REACH, SPARSE_GAP = 4.0, 8.0
-"""The same for far points, in distances between neighbours on a wall that is seen squarely; they add up."""
+"""The same for far points, in distances between neighbours on a wall that is seen squarely; to be added."""
+CLOSED = 8.0
+"""Spacings of the beams between the last point and the first, up to which a scan covers the whole circle."""
+OVERLAP = 50
+"""Points that are repeated at each end of a whole circle, so that lines cross the seam."""
+UNKNOWN_SPACING = 0.1
+"""Radians: for a scan whose points all have the same bearing."""
 SMALL = 0.6
 """Metres across: what stands alone and is smaller is a thing such as a post or a trunk."""
-FEW_LINES = 60
-"""Points on lines, from which on things that stand alone are left out: they are less exact."""
+BESIDE = np.deg2rad(3.0)
+"""Radians: a return farther aside is no neighbour."""
+FEW_LINES = 200
+"""Points on lines, from which on things that stand alone are left out, since they are less exact."""
 ENOUGH = 600
-"""Lines in a scan: of more points every second one, third one ... has its line fitted."""
+"""Lines in a scan. If there are at least twice as many points, only every second, third ... has its line."""
+FEWEST_ON_LINE = 3
+"""Points to which a line is fitted at least."""
 STRAIGHT = 0.1
-"""Spread across a line over the spread along it, as variances, above which neighbours are no line."""
+"""Variance across a line divided by the variance along it, above which neighbours are no line."""
 TYPICAL = 0.7
-"""Share of the lines whose returns scatter less than what counts as usual: rough things are fewer than walls."""
-MOST_MOVES = 20
-"""Places by which a point of a nearly sorted scan may move on average before a full sort is cheaper."""
+"""Share of the lines whose returns scatter less than what counts as usual: there are fewer rough things than
+walls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,167 +40,198 @@ class Outline:
     """The points of a scan that lie on lines.
 
     Attributes:
-        points: (P, 2) metres, x forward, y left, in angular order. Where there are few, things that stand alone
-            follow, each twice.
-        normals: (P, 2) of the lines through them, unit length, towards the laser; of a thing that stands alone
-            towards the laser and across.
-        returns: (R, 2) all points of the scan, on lines or not.
-        scatter: mean square distance of returns from their lines, in square metres.
-        normal_noise: mean square error of the normals in square radians that follows from it.
-        reach: median range of the points in metres.
+        points: (P, 2) metres, x forward, y left, moved onto their lines, in angular order. Where there are
+            few, things that stand alone follow, each twice.
+        normals: (P, 2) of the lines, unit length, towards the laser. Of a thing that stands alone the first
+            normal points towards the laser and the second across.
+        returns: (R, 2) metres: all points of the scan, on lines or not.
+        lines: how many of the points lie on lines; those of things that stand alone come after them.
+        scatter: square metres, the usual mean square distance of returns from their line.
+        normal_noise: square radians, the mean square error of the normals that follows from the scatter.
+        reach: median range of the points on lines in metres.
         spacing: median angle between neighbouring returns in radians.
     """
 
     points: FloatArray
     normals: FloatArray
     returns: FloatArray
+    lines: int
     scatter: float
     normal_noise: float
     reach: float
     spacing: float
 
 
-def find_points(ranges: FloatArray, bearings: FloatArray, farthest: float) -> FloatArray:
-    """The returns of a scan as points, in angular order.
-
-    Args:
-        ranges: (P,) metres; not positive, not finite, or at ``farthest`` or beyond: no return.
-        bearings: (P,) radians, any order and any turn of the circle.
-        farthest: metres.
-
-    Returns:
-        (R, 3): x and y in metres, and the bearing in [-pi, pi), by which they rise.
-    """
-    found = np.empty((len(ranges), 3))
-    return found[: _find_points(ranges, bearings, farthest, found)]
-
-
-@njit(cache=True)
-def _find_points(ranges, bearings, farthest, found):  # type: ignore[no-untyped-def]
-    """Fills x, y and bearing, sorted by bearing; how many there are."""
-    n = 0
-    for i in range(len(ranges)):
-        if 0 < ranges[i] < farthest and abs(bearings[i]) < 1e6:
-            b = bearings[i]
-            if not -np.pi <= b < np.pi:
-                b -= 2 * np.pi * np.floor((b + np.pi) / (2 * np.pi))
-            found[n, 0], found[n, 1] = ranges[i] * np.cos(b), ranges[i] * np.sin(b)
-            found[n, 2] = b
-            n += 1
-    falling = 0
-    for i in range(1, n):
-        falling += found[i, 2] < found[i - 1, 2]
-    if 2 * falling > n:
-        found[:n] = found[:n][::-1].copy()
-    # A revolution that begins elsewhere than behind: its parts change places.
-    for i in range(1, n):
-        if found[i, 2] < found[i - 1, 2] - np.pi:
-            found[:n] = np.concatenate((found[i:n], found[:i]))
-            break
-    moves = 0
-    for i in range(1, n):
-        j = i
-        while j > 0 and found[j - 1, 2] > found[j, 2] and moves < MOST_MOVES * n:
-            for k in range(3):
-                found[j, k], found[j - 1, k] = found[j - 1, k], found[j, k]
-            j -= 1
-            moves += 1
-    if moves >= MOST_MOVES * n:
-        found[:n] = found[:n][np.argsort(found[:n, 2])]
-    return n
-
-
 def outline(found: FloatArray) -> Outline:
     """Fits a line to the neighbours of every point.
 
     Args:
-        found: (R, 3) of :func:`find_points`.
+        found: (R, 3) of :func:`rcnn_odom.matching.points.find_points`.
     """
     points, normals = np.empty((3 * len(found), 2)), np.empty((3 * len(found), 2))
     count, *about = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0, 0.0)
-    if count < FEW_LINES:
-        count = _add_things(found, points, normals, count)
-    return Outline(points[:count], normals[:count], found[:, :2], *about)
+    lines = count
+    if lines < FEW_LINES:
+        count = _add_things(found, points, normals, lines)
+    return Outline(points[:count], normals[:count], found[:, :2], lines, *about)
 
 
-@njit(cache=True)
+@compiled
 def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
-    """Points on lines and their normals, by running sums along what is connected; how many there are, and
-    the mean squares of :class:`Outline`."""
+    """Fills in points on lines and their normals.
+
+    Returns:
+        Their number, and scatter, noise of normals, reach and spacing as in :class:`Outline`.
+    """
     n = len(found)
-    steps, apart = np.empty(n), 0
-    for i in range(1, n):
-        if found[i, 2] - found[i - 1, 2] > 1e-9:
-            steps[apart] = found[i, 2] - found[i - 1, 2]
-            apart += 1
-    spacing = quantile(steps, apart, 0.5) if apart else 0.1
-    # The circle is closed by hanging as many points on both ends as a line reaches over.
-    closed = found[0, 2] + 2 * np.pi - found[n - 1, 2] < 8 * spacing
-    extra = min(50, n // 2) if closed else 0
-    total = n + 2 * extra
-    x, y = np.empty(total), np.empty(total)
-    for i in range(total):
-        x[i], y[i] = found[(i - extra) % n, 0], found[(i - extra) % n, 1]
-    first, last = np.empty(total, np.int64), np.empty(total, np.int64)
-    radius = np.sqrt(x * x + y * y)
-    sums = np.zeros((total + 1, 5))
-    first[0] = 0
-    for i in range(total):
-        sums[i + 1, 0], sums[i + 1, 1] = sums[i, 0] + x[i], sums[i, 1] + y[i]
-        sums[i + 1, 2] = sums[i, 2] + x[i] * x[i]
-        sums[i + 1, 3], sums[i + 1, 4] = sums[i, 3] + x[i] * y[i], sums[i, 4] + y[i] * y[i]
-        if i:
-            gap = LINE_GAP + SPARSE_GAP * spacing * min(radius[i], radius[i - 1])
-            broken = (x[i] - x[i - 1]) ** 2 + (y[i] - y[i - 1]) ** 2 > gap * gap
-            first[i] = i if broken else first[i - 1]
-    last[total - 1] = total - 1
-    for i in range(total - 2, -1, -1):
-        last[i] = i if first[i + 1] == i + 1 else last[i + 1]
+    spacing = _median_spacing(found)
+    # The circle is closed by repeating points at both ends.
+    closed = found[0, 2] + 2 * np.pi - found[n - 1, 2] < CLOSED * spacing
+    extra = min(OVERLAP, n // 2) if closed else 0
+    xy, radius = _unroll(found, extra)
+    first, last = _connected(xy, radius, spacing)
+    sums = _running_sums(xy)
     count, low, high = 0, 0, 0
     scatter, ranges, noise = np.empty(n), np.empty(n), 0.0
     for i in range(extra, extra + n, max(1, n // ENOUGH)):
         reach = (LINE_REACH + SPARSE_REACH * spacing * radius[i]) ** 2
-        low, high = max(low, first[i]), max(high, i)
-        high = min(high, last[i])
-        while low < i and (x[low] - x[i]) ** 2 + (y[low] - y[i]) ** 2 > reach:
-            low += 1
-        while low > first[i] and (x[low - 1] - x[i]) ** 2 + (y[low - 1] - y[i]) ** 2 <= reach:
-            low -= 1
-        while high > i and (x[high] - x[i]) ** 2 + (y[high] - y[i]) ** 2 > reach:
-            high -= 1
-        while high < last[i] and (x[high + 1] - x[i]) ** 2 + (y[high + 1] - y[i]) ** 2 <= reach:
-            high += 1
+        low, high = _neighbours(xy, i, reach, first[i], last[i], low, high)
         m = high + 1 - low
-        if m < 3:
+        if m < FEWEST_ON_LINE:
             continue
-        mx, my = (sums[high + 1, 0] - sums[low, 0]) / m, (sums[high + 1, 1] - sums[low, 1]) / m
-        xx = (sums[high + 1, 2] - sums[low, 2]) / m - mx * mx
-        xy = (sums[high + 1, 3] - sums[low, 3]) / m - mx * my
-        yy = (sums[high + 1, 4] - sums[low, 4]) / m - my * my
-        mean, half = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
-        if mean - half > STRAIGHT * (mean + half) or half < 1e-12:
+        x, y, nx, ny, across, along = _fit_line(sums, low, high)
+        if across > STRAIGHT * along or along - across < 2e-12:
             continue
-        # The eigenvector of the larger spread, from the row that is not nearly zero.
-        along_x, along_y = (mean + half - yy, xy) if xx > yy else (xy, mean + half - xx)
-        length = np.sqrt(along_x * along_x + along_y * along_y)
-        nx, ny = -along_y / length, along_x / length
-        off = (x[i] - mx) * nx + (y[i] - my) * ny
-        if nx * x[i] + ny * y[i] > 0:
+        off = (xy[i, 0] - x) * nx + (xy[i, 1] - y) * ny
+        if nx * xy[i, 0] + ny * xy[i, 1] > 0:
             nx, ny, off = -nx, -ny, -off
-        points[count, 0], points[count, 1] = x[i] - off * nx, y[i] - off * ny
+        points[count, 0], points[count, 1] = xy[i, 0] - off * nx, xy[i, 1] - off * ny
         normals[count, 0], normals[count, 1] = nx, ny
-        # Of a line through m points: their scatter across it over m times that along it.
-        scatter[count], ranges[count] = max(mean - half, 0.0), radius[i]
-        noise += (mean - half) / (m * (mean + half))
+        scatter[count], ranges[count] = max(across, 0.0), radius[i]
+        # The variance of the direction of a line through m points.
+        noise += across / (m * along)
         count += 1
     if count == 0:
         return 0, 0.0, 0.0, 0.0, spacing
-    return count, quantile(scatter, count, TYPICAL), noise / count, quantile(ranges, count, 0.5), spacing
+    usual, middle = int(TYPICAL * count), count // 2
+    usual_scatter = np.partition(scatter[:count], usual)[usual]
+    return count, usual_scatter, noise / count, np.partition(ranges[:count], middle)[middle], spacing
 
 
-@njit(cache=True)
+@compiled
+def _median_spacing(found):  # type: ignore[no-untyped-def]
+    """Median angle between neighbours in radians."""
+    steps, apart = np.empty(len(found)), 0
+    for i in range(1, len(found)):
+        if found[i, 2] - found[i - 1, 2] > 1e-9:
+            steps[apart] = found[i, 2] - found[i - 1, 2]
+            apart += 1
+    return np.partition(steps[:apart], apart // 2)[apart // 2] if apart else UNKNOWN_SPACING
+
+
+@compiled
+def _unroll(found, extra):  # type: ignore[no-untyped-def]
+    """Points (T, 2) with so many repeated at both ends of the circle, and their ranges (T,)."""
+    n = len(found)
+    xy = np.empty((n + 2 * extra, 2))
+    for i in range(len(xy)):
+        xy[i, 0], xy[i, 1] = found[(i - extra) % n, 0], found[(i - extra) % n, 1]
+    return xy, np.sqrt(xy[:, 0] * xy[:, 0] + xy[:, 1] * xy[:, 1])
+
+
+@compiled
+def _connected(xy, radius, spacing):  # type: ignore[no-untyped-def]
+    """The first and the last point (T,), (T,) of the run without a jump to which each point belongs."""
+    total = len(xy)
+    first, last = np.empty(total, np.int64), np.empty(total, np.int64)
+    first[0], last[total - 1] = 0, total - 1
+    for i in range(1, total):
+        gap = LINE_GAP + SPARSE_GAP * spacing * min(radius[i], radius[i - 1])
+        broken = (xy[i, 0] - xy[i - 1, 0]) ** 2 + (xy[i, 1] - xy[i - 1, 1]) ** 2 > gap * gap
+        first[i] = i if broken else first[i - 1]
+    for i in range(total - 2, -1, -1):
+        last[i] = i if first[i + 1] == i + 1 else last[i + 1]
+    return first, last
+
+
+@compiled
+def _running_sums(xy):  # type: ignore[no-untyped-def]
+    """Sums (T + 1, 5) of x, y, xx, xy and yy over the points before each."""
+    sums = np.zeros((len(xy) + 1, 5))
+    for i in range(len(xy)):
+        x, y = xy[i, 0], xy[i, 1]
+        sums[i + 1, 0], sums[i + 1, 1] = sums[i, 0] + x, sums[i, 1] + y
+        sums[i + 1, 2], sums[i + 1, 3] = sums[i, 2] + x * x, sums[i, 3] + x * y
+        sums[i + 1, 4] = sums[i, 4] + y * y
+    return sums
+
+
+@compiled
+def _neighbours(xy, i, reach, first, last, low, high):  # type: ignore[no-untyped-def]
+    """The first and the last neighbour of a point, moved on from those of the point before.
+
+    Args:
+        xy: (T, 2) metres.
+        i: the point.
+        reach: square metres.
+        first, last: the run of connected points to which it belongs.
+        low, high: of the point before.
+    """
+    low, high = max(low, first), min(max(high, i), last)
+    while low < i and _square(xy, low, i) > reach:
+        low += 1
+    while low > first and _square(xy, low - 1, i) <= reach:
+        low -= 1
+    while high > i and _square(xy, high, i) > reach:
+        high -= 1
+    while high < last and _square(xy, high + 1, i) <= reach:
+        high += 1
+    return low, high
+
+
+@compiled
+def _square(xy, i, j):  # type: ignore[no-untyped-def]
+    """Square of the distance between two points."""
+    return (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2
+
+
+@compiled
+def _fit_line(sums, low, high):  # type: ignore[no-untyped-def]
+    """The line through some points: their mean, its normal, and the variances across and along it."""
+    m = high + 1 - low
+    x, y = (sums[high + 1, 0] - sums[low, 0]) / m, (sums[high + 1, 1] - sums[low, 1]) / m
+    xx = (sums[high + 1, 2] - sums[low, 2]) / m - x * x
+    xy = (sums[high + 1, 3] - sums[low, 3]) / m - x * y
+    yy = (sums[high + 1, 4] - sums[low, 4]) / m - y * y
+    mean, half = (xx + yy) / 2, np.sqrt(((xx - yy) / 2) ** 2 + xy * xy)
+    # The eigenvector of the larger variance, from the row that is not nearly zero.
+    along_x, along_y = (mean + half - yy, xy) if xx > yy else (xy, mean + half - xx)
+    length = np.sqrt(along_x * along_x + along_y * along_y)
+    if length == 0.0:
+        return x, y, 0.0, 0.0, 0.0, 0.0
+    return x, y, -along_y / length, along_x / length, mean - half, mean + half
+
+
+@compiled
+def _stands_alone(found, start, stop, radius):  # type: ignore[no-untyped-def]
+    """Whether what lies beside the returns start to stop - 1, so many metres away, is behind them or nothing.
+
+    Beams that graze a wall meet it far apart as well, but there one neighbour is nearer than the other.
+    """
+    n = len(found)
+    for here, beside in ((start, start - 1), (stop - 1, stop)):
+        other = beside % n
+        apart = abs(found[other, 2] - found[here, 2])
+        if min(apart, 2 * np.pi - apart) > BESIDE or start == other:
+            continue
+        if np.sqrt(found[other, 0] ** 2 + found[other, 1] ** 2) < radius + SMALL:
+            return False
+    return True
+
+
+@compiled
 def _add_things(found, points, normals, count):  # type: ignore[no-untyped-def]
-    """Appends small things that stand alone, as points that are held both ways; how many points there are."""
+    """Appends small things that stand alone, as points that are held both ways; returns the new count."""
     n = len(found)
     start = 0
     for i in range(1, n + 1):
@@ -201,7 +240,7 @@ def _add_things(found, points, normals, count):  # type: ignore[no-untyped-def]
         wide = (found[i - 1, 0] - found[start, 0]) ** 2 + (found[i - 1, 1] - found[start, 1]) ** 2
         x, y = np.mean(found[start:i, 0]), np.mean(found[start:i, 1])
         radius = np.sqrt(x * x + y * y)
-        if wide < SMALL**2 and radius > 1e-3:
+        if wide < SMALL**2 and radius > 1e-3 and _stands_alone(found, start, i, radius):
             for k in range(2):
                 points[count, 0], points[count, 1] = x, y
                 normals[count, 0] = -x / radius if k == 0 else -y / radius

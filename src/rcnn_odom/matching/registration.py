@@ -7,7 +7,13 @@ import numpy as np
 from rcnn_odom.geometry import FloatArray, advance, relative_step, wrap_angle
 from rcnn_odom.matching import yaw
 from rcnn_odom.matching.align import Table, align, build_table
-from rcnn_odom.matching.covariance import CORRELATED, Aligned, Uncertainty, hold_undetermined, weakest_direction
+from rcnn_odom.matching.covariance import (
+    CORRELATED,
+    Aligned,
+    Uncertainty,
+    hold_undetermined,
+    weakest_direction,
+)
 from rcnn_odom.matching.local_map import LocalMap
 from rcnn_odom.matching.outline import Outline
 
@@ -18,12 +24,12 @@ MOST_POINTS = 300
 VOXEL, MOST_WEIGHT = 0.1, 10.0
 """Metres, and scans whose mean a cell of the map is; see :class:`LocalMap`."""
 MAP_LENGTH, SHORTEST_MAP = 2.0, 1.5
-"""The map remembers the last metres of the way: so many median ranges of a scan, at least some metres. Further
-back it would hold on to old errors; nearer, lose what has left the field of view."""
+"""The length of the way that the map remembers, in median ranges of a scan, and at least in metres. A longer
+one would hold on to old errors; a shorter one would lose what has left the field of view."""
 KEY_DISTANCE, KEY_TURN, KEY_SHARE = 0.2, np.deg2rad(10.0), 0.9
-"""A scan is added to the map after so many metres or radians, or when fewer of its points are in the map ..."""
+"""A scan is added to the map after so many metres or radians, or when less of it is in the map ..."""
 KEY_LEAST = 0.25
-"""... and it is at least this part of the former away: at rest nothing is added, so that nothing can drift."""
+"""... and it is at least this part of the former away. At rest nothing is added, so that nothing drifts."""
 TABLE_FARTHEST = 120.0
 """Metres: cells of the map that are farther away are not looked at."""
 WIDE_GATE, NARROW_GATE, GATE_ERRORS = 5.0, 1.0, 3.0
@@ -52,6 +58,8 @@ CALM = 0.04
 """Times the gate: residuals of this size keep their weight even where most are smaller. A centimetre at last;
 while the gate is open the few walls across a street must pull as well as the many along it."""
 MOST_STEPS = 30
+ENOUGH_LINES = 60
+"""Points on lines, from which on these alone tell whether a scan fits."""
 SCORE_WIDTH = 0.15
 """Metres of a residual that counts for nothing in the score."""
 SETTINGS = np.array([CLOSEST_GATE, GATE_SHRINKS, SAME_WALL, CALM, MOST_STEPS, SCORE_WIDTH])
@@ -61,6 +69,10 @@ POINT_ERROR = 0.01
 """Metres of a usual point's error, against which a measured guess is weighed."""
 TURNS, FEWEST_FOR_TURNS = 5, 30
 """Peaks of the correlation of normals that are tried as turns, and points that tell of them."""
+NEAR_GATE = 1.5
+"""Metres of the gate where another start is thought to be near."""
+SHIFTS = (0.5, 1.0, 1.5, 2.0, 3.0)
+"""Metres straight ahead of where the laser was, where other starts are tried."""
 FIRST_SHIFTS = (0.75, 1.5, 3.0, 4.5, -0.75, -1.5)
 """Metres ahead that are tried as well while the motion is not known yet."""
 FORGET_EVERY = 10
@@ -123,6 +135,7 @@ class Registration:
         """Begins a new map with a scan at the present pose."""
         self._map.clear()
         self._lost, self._guess_error, self.knows_motion = 0, np.inf, False
+        self._uncertainty = Uncertainty()
         self._since = self._travelled
         self.is_empty = len(scan.points) < FEWEST_POINTS
         if not self.is_empty:
@@ -140,7 +153,7 @@ class Registration:
         if len(scan.points) < FEWEST_POINTS:
             return self._lose(scan, guess, spread)
         found, has_rival = self._search(scan, guess, _stiffness(spread) if trust else WEAK_PRIOR)
-        if found.score < LEAST_SCORE:
+        if found.fit < LEAST_SCORE:
             return self._lose(scan, guess, spread)
         pose, held, information = hold_undetermined(found, guess)
         off = float(np.hypot(*(pose - guess)[:2])), abs(float(wrap_angle(pose[2] - guess[2])))
@@ -154,48 +167,54 @@ class Registration:
         covariances = self._uncertainty.update(before, pose, spread, information)
         return Match(
             *(pose, *covariances, held),
-            is_poor=found.score < GOOD_SCORE,
+            is_poor=found.fit < GOOD_SCORE,
             is_ambiguous=has_rival,
             surprise=off if is_sudden else (0.0, 0.0),
         )
 
     def _search(self, scan: Outline, guess: FloatArray, stiffness: FloatArray) -> tuple[Aligned, bool]:
-        """The best alignment from the guess on, or where that is poor, from others as well; has it a rival?"""
-        points, normals, found = *_thin(scan), np.zeros((7, 3))
+        """The best alignment from the guess on, or where that is poor from others as well; has it a rival?"""
+        points, normals = _thin(scan)
+        # Things that stand alone look different from elsewhere; where there are lines, they alone tell it.
+        lines = len(points) * scan.lines // len(scan.points) if scan.lines >= ENOUGH_LINES else len(points)
+        found = np.zeros((7, 3))
 
         def align_from(start: FloatArray, gate: float) -> Aligned:
             table = self._table
-            pose, score = align(
+            pose, score, fit = align(
                 *(points, normals, table.entries, table.starts, table.centre),
-                *(start, guess, stiffness, gate, SPARSE_GATE * scan.spacing, SETTINGS, found),
+                *(start, guess, stiffness, gate, SPARSE_GATE * scan.spacing, lines, SETTINGS, found),
             )
-            return Aligned.of(pose, score, found, scan, len(points))
+            return Aligned.of(pose, score, fit, found, scan, len(points))
 
         gate = min(WIDE_GATE, max(NARROW_GATE, GATE_ERRORS * self._guess_error))
         best = align_from(guess, gate)
-        starts: list[FloatArray] = []
-        if best.score < GOOD_SCORE or not self.knows_motion:
+        starts: list[tuple[FloatArray, float]] = []
+        if best.fit < GOOD_SCORE or not self.knows_motion:
             starts = self._other_starts(scan, guess, gate)
         elif (weak := weakest_direction(best)) is not None:
-            starts = [guess + shift * weak for shift in WEAK_SHIFTS]
+            starts = [(guess + shift * weak, WIDE_GATE) for shift in WEAK_SHIFTS]
         if not starts:
             return best, False
-        found_all = [best, *(align_from(start, WIDE_GATE) for start in starts)]
+        found_all = [best, *(align_from(*start) for start in starts)]
         # What is nearer to the guess is preferred, so that a twin must fit better by more than chance.
         best = max(found_all, key=lambda other: other.score - _penalty(other.pose, guess, other is not best))
         return best, any(_is_rival(other, best) for other in found_all)
 
-    def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[FloatArray]:
-        """Poses where the laser may be as well: by the turn that the normals tell, or where it was."""
-        starts = [guess] if gate < WIDE_GATE else []
-        starts.append(self.pose)
+    def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[tuple[FloatArray, float]]:
+        """Poses where the laser may be as well, with the gates to begin with.
+
+        By the turn that the normals tell, where it was, or straight ahead of there.
+        """
+        starts = [(guess, other) for other in (WIDE_GATE, NEAR_GATE) if other != gate]
+        starts.append((self.pose, WIDE_GATE))
         turns = TURNS if len(scan.points) >= FEWEST_FOR_TURNS else 0
         for turn in yaw.turn_candidates(self._key_normals, scan.normals, turns):
             heading = self._key_pose[2] + turn
-            starts += [np.array([x, y, heading]) for x, y in (guess[:2], self.pose[:2])]
-        if not self.knows_motion:
-            starts += [advance(guess, np.array([shift, 0.0, 0.0])) for shift in FIRST_SHIFTS]
-        return starts
+            starts += [(np.array([x, y, heading]), WIDE_GATE) for x, y in (guess[:2], self.pose[:2])]
+        ahead = np.array([self.pose[0], self.pose[1], guess[2]])
+        shifts, gate = (SHIFTS, NEAR_GATE) if self.knows_motion else (FIRST_SHIFTS, WIDE_GATE)
+        return starts + [(advance(ahead, np.array([shift, 0.0, 0.0])), gate) for shift in shifts]
 
     def _lose(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
         """The guess, for a scan that does not fit the map; after several of them a new map begins there."""

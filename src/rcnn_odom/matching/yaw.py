@@ -1,16 +1,17 @@
 """How far a scan is turned, from its normals alone: circular correlation of their histograms."""
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray, wrap_angle
 
 BINS = 360
+"""Of the circle of directions, so that each is a degree wide."""
 SMOOTH = 3
-"""Degrees of the kernel's half width."""
+"""Bins on each side over which a direction is spread."""
 
 
-@njit(cache=True)
+@compiled
 def _histogram(normals):  # type: ignore[no-untyped-def]
     """Smoothed histogram (360,) of the directions of normals (P, 2)."""
     raw = np.zeros(BINS)
@@ -25,7 +26,15 @@ def _histogram(normals):  # type: ignore[no-untyped-def]
 
 
 def turn_candidates(before: FloatArray, now: FloatArray, most: int) -> FloatArray:
-    """The turns in radians between two scans on which their normals (P, 2) agree best, the best first."""
+    """The turns between two scans by which their normals agree best.
+
+    Args:
+        before, now: (P, 2), (Q, 2) normals, each in the frame of its scan.
+        most: the largest number of turns.
+
+    Returns:
+        (N,) radians in [-pi, pi), the best first; N is at most ``most``.
+    """
     spectra = np.fft.rfft(_histogram(before)) * np.conj(np.fft.rfft(_histogram(now)))
     agreement = np.fft.irfft(spectra, BINS)
     peaks = np.flatnonzero((agreement >= np.roll(agreement, 1)) & (agreement > np.roll(agreement, -1)))

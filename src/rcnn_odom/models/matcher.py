@@ -9,7 +9,8 @@ import numpy as np
 from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_step
 from rcnn_odom.matching.deskew import deskew
 from rcnn_odom.matching.no_return import NoReturn
-from rcnn_odom.matching.outline import Outline, find_points, outline
+from rcnn_odom.matching.outline import Outline, outline
+from rcnn_odom.matching.points import find_points
 from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
 from rcnn_odom.models.contract import Model
 from rcnn_odom.models.encoding import Sensor
@@ -25,8 +26,9 @@ LONGEST_HOLD = 10.0
 GUESS_DISTANCE, GUESS_TURN = 0.1, 0.1
 """Metres and radians a period by which the last motion is off as a guess, and beside them half of itself."""
 WHEELS_DISTANCE, WHEELS_TURN = 0.01, 0.01
-"""The same of wheel odometry, beside a tenth of itself."""
+"""The same of wheel odometry."""
 SLIP = 0.1
+"""Part of a motion by which wheel odometry is off beside that."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class MatcherTracker:
 
     Notes are of these kinds:
 
-    - *no returns*, or fewer than 15 points on anything straight (*few returns*): the last motion goes on.
+    - *no returns*, or fewer than six points on anything (*few returns*): the last motion goes on.
     - *no match*: the scan does not fit the map; the last motion goes on. After several in a row a new map
       begins (*new map*).
     - *held*: what is seen does not determine the motion along a direction; along it the last motion goes on.
@@ -84,15 +86,15 @@ class MatcherTracker:
         """Begins a new map with a scan."""
         found = self._find_outline(scan)
         self._registration.begin(found)
-        self._motion = np.zeros(3)
+        self._motion, self._held = np.zeros(3), 0.0
         self._wheel_pose = scan.wheel_pose
         return () if self.has_seen else (f"{_describe(found)}: none to compare with yet",)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
         """The step to one more scan."""
-        share = self._share_of_motion(periods, seconds)
+        passed = self._motions_passed(periods, seconds)
         scan_outline = self._find_outline(scan)
-        guess, spread, is_measured = self._guess(scan, share)
+        guess, spread, is_measured = self._guess(scan, passed)
         before = self._registration.pose
         cos, sin = np.cos(before[2]), np.sin(before[2])
         turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
@@ -100,37 +102,43 @@ class MatcherTracker:
             scan_outline, advance(before, guess), turned @ spread @ turned.T, is_measured
         )
         step = relative_step(before, match.pose)
+        x, y, heading = step.tolist()
         self._wheel_pose = scan.wheel_pose
         if match.fits:
             self._motion, self._held = step if seconds else step / periods, 0.0
             self._seconds = seconds or math.nan
         else:
-            self._held += share
+            self._held += passed
         notes = _describe_match(match, scan_outline)
-        return Registered(Step(*step.tolist(), match.step, match.noise), notes, match.fits)
+        return Registered(Step(x, y, heading, match.step, match.noise), notes, match.fits)
 
-    def _share_of_motion(self, periods: int, seconds: float | None) -> float:
-        """How often the last motion fits into the time since then."""
-        share = float(periods)
-        if seconds and self._seconds > 0:
-            share = seconds / self._seconds
-        return max(0.0, min(share, LONGEST_HOLD - self._held))
+    def _motions_passed(self, periods: int, seconds: float | None) -> float:
+        """How often the last motion fits into the time since the last scan."""
+        return seconds / self._seconds if seconds and self._seconds > 0 else float(periods)
 
-    def _guess(self, scan: Scan, share: float) -> tuple[FloatArray, FloatArray, bool]:
-        """The step (3,) that is expected, its covariance (3, 3), and whether it was measured."""
+    def _guess(self, scan: Scan, passed: float) -> tuple[FloatArray, FloatArray, bool]:
+        """The step (3,) that is expected, its covariance (3, 3), and whether it was measured.
+
+        Args:
+            scan: the next one.
+            passed: how often the last motion fits into the time since the last scan.
+        """
+        unknown = np.zeros(2)
         if self.wheels and scan.wheel_pose is not None and self._wheel_pose is not None:
             guess = relative_step(np.array(self._wheel_pose), np.array(scan.wheel_pose))
             least, part = (WHEELS_DISTANCE, WHEELS_TURN), SLIP
             is_measured = True
         else:
-            guess = np.zeros(3)
+            guess, share = np.zeros(3), max(0.0, min(passed, LONGEST_HOLD - self._held))
             whole = int(share)
             for _ in range(whole):
                 guess = advance(guess, self._motion)
             guess = advance(guess, (share - whole) * self._motion)
-            least, part, is_measured = (GUESS_DISTANCE * share, GUESS_TURN * share), 0.5, False
-        distance = least[0] + part * float(np.hypot(guess[0], guess[1]))
-        turn = least[1] + part * abs(float(guess[2]))
+            least, part, is_measured = (GUESS_DISTANCE * passed, GUESS_TURN * passed), 0.5, False
+            # Whether it goes on for longer than that is not known.
+            unknown = (passed - share) * np.abs([np.hypot(*self._motion[:2]), self._motion[2]])
+        distance = least[0] + part * float(np.hypot(guess[0], guess[1])) + float(unknown[0])
+        turn = least[1] + part * abs(float(guess[2])) + float(unknown[1])
         return guess, np.diag([distance**2, distance**2, turn**2]), is_measured
 
     def _find_outline(self, scan: Scan) -> Outline:

@@ -7,14 +7,20 @@ from enum import Enum
 
 import numpy as np
 
-from rcnn_odom.geometry import Step, Steps
+from rcnn_odom.geometry import FloatArray, Step, Steps, advance, wrap_angle
 from rcnn_odom.models.streaming import ScanTracker
 from rcnn_odom.recordings.beams import PATIENCE
 from rcnn_odom.recordings.clock import LATE, Clock
 from rcnn_odom.recordings.scan import Scan
 
-OTHER_FRAME = "other frame"
-"""Kind of trouble."""
+OTHER_FRAME, TO_AND_FRO = "other frame", "to and fro"
+"""Kinds of trouble."""
+SWINGS = 2
+"""Steps in a row that take the one before back, from which on that is told ..."""
+SWING_DISTANCE, SWING_TURN = 0.1, math.radians(10.0)
+"""... and metres or radians of such a step at least: no robot moves to and fro at the rate of its scans."""
+TAKEN_BACK = 1 / 3
+"""Part of a step that is left of it and of the one before at most."""
 PASSED_OVER = (LATE, OTHER_FRAME)
 """Kinds of trouble whose scans are not used, so that the pose is the last one again."""
 
@@ -63,6 +69,8 @@ class Tracking:
       others, is none.
     - *other frame*, a scan of another ``frame_id`` than the scans before: passed over as of another laser.
       After five of them in a row it is the laser's (*new frame*), and no motion is added to there.
+    - *to and fro*: each of the last two steps takes the one before it back, as where two lasers write to one
+      topic under one name; the estimate stands.
     - *slow scans*: more than 1.5 times the period of training between them; the estimate stands.
     - *fast scans*: less than the period of training over 1.5; the estimate stands, but gaps are counted in
       periods of training, so that short ones are not noticed.
@@ -80,7 +88,7 @@ class Tracking:
         self.tracker.reset()
         self._clock = Clock(self.tracker.period)
         self._frame, self._of_other_frame, self._begun = "", 0, False
-        self._ranges = np.empty(0)
+        self._ranges, self._swings = np.empty(0), _Swings()
 
     def step(self, scan: Scan) -> Tracked:
         """The step to one more scan."""
@@ -99,7 +107,8 @@ class Tracking:
             return self._begin((*notes, *self.tracker.begin(scan), *tick.notes))
         found = self.tracker.register(scan, tick.periods, tick.seconds)
         kind = Kind.ESTIMATED if found.is_estimated else Kind.HELD
-        return Tracked(found.step, kind, (*notes, *found.notes, *tick.notes))
+        swings = self._swings.add(found.step.array())
+        return Tracked(found.step, kind, (*notes, *found.notes, *swings, *tick.notes))
 
     def _follow_frame(self, frame: str) -> list[str]:
         """Takes a scan's frame for the laser's; words about it where the laser had another one."""
@@ -117,6 +126,27 @@ class Tracking:
             Tracked(Step(0.0, 0.0, 0.0), Kind.UNKNOWN, notes)
             if begun
             else Tracked(no_step(), Kind.FIRST, notes)
+        )
+
+
+class _Swings:
+    """Counts steps in a row that take each other back."""
+
+    def __init__(self) -> None:
+        self._last, self._count = np.zeros(3), 0
+
+    def add(self, step: FloatArray) -> tuple[str, ...]:
+        """One more step (3,); words about it where it is one too many that go to and fro."""
+        both, self._last = advance(self._last, step), step
+        distance, turn = math.hypot(step[0], step[1]), abs(float(wrap_angle(step[2])))
+        is_back = distance > SWING_DISTANCE and math.hypot(both[0], both[1]) < TAKEN_BACK * distance
+        turns_back = turn > SWING_TURN and abs(float(wrap_angle(both[2]))) < TAKEN_BACK * turn
+        self._count = self._count + 1 if is_back or turns_back else 0
+        if self._count < SWINGS:
+            return ()
+        return (
+            f"{TO_AND_FRO}: {distance:.2f} m and {math.degrees(turn):.0f} degrees in every step, as where "
+            "two lasers write to one topic",
         )
 
 

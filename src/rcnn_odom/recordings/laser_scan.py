@@ -1,6 +1,7 @@
 """ROS's message LaserScan, from a bag, a live node or rosbridge, as a scan."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import numpy.typing as npt
@@ -40,8 +41,9 @@ def from_laser_scan(
         angle_max: radians, of the last beam; where the increment is 0 or nan, the beams are even up to it.
         range_min, range_max: metres. At ``range_max`` or beyond it a reading is no return, and infinite here.
             A maximum that is nan or not above the minimum is unknown.
-        time_increment: seconds from one beam to the next; not positive: as ``scan_time`` says.
-        scan_time: seconds from one scan to the next, in which the laser turns once; not positive: unknown.
+        time_increment: seconds from one beam to the next; not positive: unknown.
+        scan_time: seconds from one scan to the next, see :func:`assume_even_turn`; not positive, or more
+            than ten: unknown.
         stamp: seconds; None where there is no clock.
         frame_id: name of the laser's frame.
 
@@ -65,9 +67,10 @@ def from_laser_scan(
     return Scan(
         ranges=values,
         bearings=bearings,
-        times=_times(beam, spacing, time_increment, scan_time),
+        times=checked_times(time_increment * beam) if 0 < time_increment < math.inf else None,
         stamp=stamp,
         frame_id=frame_id,
+        turn_time=scan_time if 0 < scan_time <= LONGEST_SCAN else None,
     )
 
 
@@ -97,14 +100,22 @@ def has_most_beyond(ranges: FloatArray, limit: float) -> bool:
     return bool(np.count_nonzero(measured > limit) > len(measured) / 2)
 
 
-def _times(beam: FloatArray, spacing: float, time_increment: float, scan_time: float) -> FloatArray | None:
-    """Seconds (P,) of beams (P,) after the first; None: nothing tells, or nothing that can be.
+def assume_even_turn(scan: Scan) -> Scan:
+    """The scan, its beams one after the other as the laser turns, where only the time of a turn is known.
 
-    A laser of less than 360 degrees turns on unseen: its beams take only their part of the turn.
+    Not so unless a user says it: drivers of lasers that turn write ``time_increment``; what writes only
+    ``scan_time`` is mostly a depth camera, a merger of scans or a cut through a cloud, whose beams were shot
+    at once or in another order. A laser of less than 360 degrees turns on unseen: its beams take only their
+    part of the turn.
+
+    >>> scan = from_laser_scan([1.0] * 4, 0.0, math.pi / 2, scan_time=0.2)
+    >>> scan.times is None, assume_even_turn(scan).times.round(3).tolist()
+    (True, [0.0, 0.05, 0.1, 0.15])
     """
-    if not time_increment > 0:  # so it is of nan
-        time_increment = scan_time * abs(spacing) / (2 * math.pi) if scan_time <= LONGEST_SCAN else math.nan
-    return checked_times(time_increment * beam) if 0 < time_increment < math.inf else None
+    if scan.times is not None or scan.turn_time is None or scan.bearings is None or len(scan.bearings) < 2:
+        return scan
+    part_of_turn = abs(scan.bearings[1] - scan.bearings[0]) / (2 * math.pi)
+    return replace(scan, times=checked_times(scan.turn_time * part_of_turn * np.arange(len(scan.bearings))))
 
 
 def checked_times(times: FloatArray) -> FloatArray | None:

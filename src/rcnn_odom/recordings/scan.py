@@ -23,6 +23,8 @@ class Scan:
             be told; False where only returns are given, as the points of a cloud.
         wheel_pose: x and y in metres and heading in radians of the laser by the robot's own odometry when
             the scan was taken, in whatever frame that has; None: unknown.
+        turn_time: seconds that the laser takes for a whole turn, if it turns; None: unknown. Without
+            ``times`` they do not tell when each beam was shot: what sees all at once says them as well.
     """
 
     ranges: FloatArray
@@ -32,6 +34,7 @@ class Scan:
     frame_id: str = ""
     has_all_beams: bool = True
     wheel_pose: tuple[float, float, float] | None = None
+    turn_time: float | None = None
 
     def __post_init__(self) -> None:
         for values in (self.bearings, self.times):

@@ -1,9 +1,12 @@
 """Where the beams of a laser end: a depth buffer over upright walls, then a march over the ground."""
 
+from functools import partial
+
 import numpy as np
 import numpy.typing as npt
-from numba import njit, vectorize
+from numba import vectorize
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Walls
 from rcnn_odom.simulation.terrain import Ground, height_at
@@ -82,7 +85,7 @@ def _after_walls(
     return squareness
 
 
-@vectorize(cache=True)
+@partial(compiled, how=vectorize)
 def _azimuth_rank(x, y):  # type: ignore[no-untyped-def]
     """Grows with the azimuth, from -2 to 2: all that sorting asks for, at a tenth of an arctangent's cost."""
     share = y / (abs(x) + abs(y))
@@ -91,7 +94,7 @@ def _azimuth_rank(x, y):  # type: ignore[no-untyped-def]
     return 2 - share if y >= 0 else -2 - share
 
 
-@njit(cache=True)
+@compiled
 def _first_beam(ranks, table, rank):  # type: ignore[no-untyped-def]
     """The first of the sorted beams that is not before a direction; the table saves the search."""
     beam = table[int((rank + 2) * (_CELLS / 4))]
@@ -102,7 +105,7 @@ def _first_beam(ranks, table, rank):  # type: ignore[no-untyped-def]
     return beam
 
 
-@njit(cache=True)
+@compiled
 def _nearest_walls(  # type: ignore[no-untyped-def]
     ends, heights, origin, beams, max_range
 ):
@@ -137,7 +140,7 @@ def _nearest_walls(  # type: ignore[no-untyped-def]
     return depth, hit
 
 
-@njit(cache=True)
+@compiled
 def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
     ends, heights, origins, beams, max_range
 ):
@@ -169,7 +172,7 @@ def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
     return depth, hit
 
 
-@njit(cache=True)
+@compiled
 def _seen_between(wall, middle, apart, max_range):  # type: ignore[no-untyped-def]
     """The rank of the first beam that may meet a wall, and by how much the last one's is greater.
 
@@ -193,7 +196,7 @@ def _seen_between(wall, middle, apart, max_range):  # type: ignore[no-untyped-de
     return (start - slack + 2) % 4 - 2, width
 
 
-@njit(cache=True)
+@compiled
 def _squareness(ends, hit, beams):  # type: ignore[no-untyped-def]
     _, east, north, _ = beams
     squareness = np.zeros(len(hit))
@@ -204,7 +207,7 @@ def _squareness(ends, hit, beams):  # type: ignore[no-untyped-def]
     return squareness
 
 
-@njit(cache=True)
+@compiled
 def _meet_ground(  # type: ignore[no-untyped-def]
     heights, corner, step, steepest, origins, beams, max_range, depth, hit, squareness
 ):

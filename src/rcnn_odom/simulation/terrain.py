@@ -4,8 +4,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from numba import njit
 
+from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 GRID_STEP = 5.0
@@ -40,7 +40,7 @@ class Ground:
         return _heights(self.heights, self.corner, self.step, points)
 
 
-@njit(cache=True)
+@compiled
 def height_at(heights, corner, step, x, y):  # type: ignore[no-untyped-def]
     """Height in metres at one point of a :class:`Ground`, for loops that are compiled."""
     across, along = (x - corner[0]) / step, (y - corner[1]) / step
@@ -51,7 +51,7 @@ def height_at(heights, corner, step, x, y):  # type: ignore[no-untyped-def]
     return near * (1 - u) + (heights[i + 1, j] * (1 - v) + heights[i + 1, j + 1] * v) * u
 
 
-@njit(cache=True)
+@compiled
 def _heights(heights, corner, step, points):  # type: ignore[no-untyped-def]
     out = np.empty(len(points))
     for i in range(len(points)):
