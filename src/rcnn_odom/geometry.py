@@ -195,9 +195,7 @@ class AccumulatedCovariance:
         lasting = step.covariance
         if self._open.any() or step.taken_back.any():
             before = _carry(_lever(step.x, step.y), self._open)
-            lasting = _without_negative(
-                lasting - before - _carry(_turn(step.heading), step.taken_back)
-            )
+            lasting = _without_negative(lasting - before - _carry(_turn(step.heading), step.taken_back))
         self._open = step.taken_back
         self._drift = _add_up(pose[2], self._drift, step, lasting)
         self.value = self._drift + _carry(_turn(pose[2] + step.heading), self._open)

@@ -18,11 +18,13 @@ WEAK_INFORMATION = 0.03
 have errors in common."""
 HARDLY = 0.05
 """The same, below which other places along a direction are tried as well."""
+HARDLY_TURNS = 0.1
+"""Radians a metre: a direction that is held along with less than that of a turn is one of the plane."""
 MAP_ERROR = 0.006
 """Metres: the error of a point of the map in addition to the scatter of a scan."""
 CORRELATED = 1.0
 """Points that share one error, as neighbours on a wall share those of the wall and its line. Fitted."""
-DRIFTS = np.array([1.2, 0.5])
+DRIFTS = np.array([1.5, 0.5])
 """Variance by which a map that moves along drifts per metre and per radian, over the variance of a match.
 Fitted."""
 
@@ -107,7 +109,17 @@ def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
     off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
     held = pose - directions @ (share * (directions.T @ off))
     strengths = of_all * strengths * strengths / (strengths + WEAK_INFORMATION)
-    return held, directions, share, (directions * strengths) @ directions.T
+    weighed = (directions * strengths) @ directions.T
+    for k in range(3):
+        # A wall that is not quite straight feigns that the heading is held a little with the way along it.
+        if share[k] > 0.5 and abs(directions[2, k]) < HARDLY_TURNS:
+            along = directions[:, k].copy()
+            along[2] = 0.0
+            along /= np.sqrt(along[0] ** 2 + along[1] ** 2)
+            directions[:, k] = along
+            across = np.eye(3) - np.outer(along, along)
+            weighed = across @ weighed @ across
+    return held, directions, share, weighed
 
 
 class Uncertainty:

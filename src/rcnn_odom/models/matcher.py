@@ -1,13 +1,16 @@
 """Odometry by scan matching, for any 2D laser, without training."""
 
 import math
+from collections import deque
 from dataclasses import dataclass
+from functools import cache
 from typing import Any, ClassVar
 
 import numpy as np
 
 from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_step
 from rcnn_odom.matching.deskew import deskew
+from rcnn_odom.matching.local_map import LocalMap
 from rcnn_odom.matching.no_return import NoReturn
 from rcnn_odom.matching.outline import Outline, outline
 from rcnn_odom.matching.points import find_points
@@ -42,6 +45,25 @@ class MatcherOptions:
     wheels: bool = False
 
 
+@cache
+def compile_matching() -> None:
+    """Compiles what a scan needs, or loads it from the cache, so that the first scan does not wait for it."""
+    bearings = np.linspace(-np.pi, np.pi, 90)
+    room = np.minimum(
+        3 / np.maximum(np.abs(np.cos(bearings)), 0.1), 2 / np.maximum(np.abs(np.sin(bearings)), 0.1)
+    )
+    no_return, registration = NoReturn(), Registration()
+    for scale in (1.0, 1.0, 3.0):  # the last does not fit, so that other starts are tried as well
+        moved, turned = deskew(scale * room, bearings, np.zeros(90), np.ones(3))
+        found = outline(find_points(moved, turned, no_return.limit(moved, FARTHEST)))
+        if registration.is_empty:
+            registration.begin(found)
+        registration.register(found, np.zeros(3), np.eye(3))
+    few = outline(find_points(np.full(6, 5.0), np.arange(6.0), FARTHEST))
+    registration.register(few, np.zeros(3), np.eye(3))
+    LocalMap(0.1, 1.0).forget(0.0)
+
+
 class MatcherTracker:
     """Registers each scan against a map of what the laser has seen lately.
 
@@ -64,12 +86,15 @@ class MatcherTracker:
 
     def __init__(self, wheels: bool = False, deskew: bool = True) -> None:
         self.wheels, self.deskew = wheels, deskew
+        compile_matching()
         self.reset()
 
     def reset(self) -> None:
         """Forgets everything."""
         self._registration, self._no_return = Registration(), NoReturn()
         self._motion, self._seconds, self._held = np.zeros(3), math.nan, 0.0
+        self._velocities: deque[FloatArray] = deque(maxlen=2)
+        self._held_in_a_row, self._held_directions = 0, np.empty((3, 0))
         self._wheel_pose: tuple[float, float, float] | None = None
         self._returns = np.empty((0, 2))
 
@@ -86,7 +111,8 @@ class MatcherTracker:
         """Begins a new map with a scan."""
         found = self._find_outline(scan)
         self._registration.begin(found)
-        self._motion, self._held = np.zeros(3), 0.0
+        self._motion, self._held, self._held_in_a_row = np.zeros(3), 0.0, 0
+        self._velocities.clear()
         self._wheel_pose = scan.wheel_pose
         return () if self.has_seen else (f"{_describe(found)}: none to compare with yet",)
 
@@ -96,19 +122,20 @@ class MatcherTracker:
         scan_outline = self._find_outline(scan)
         guess, spread, is_measured = self._guess(scan, passed)
         before = self._registration.pose
-        cos, sin = np.cos(before[2]), np.sin(before[2])
-        turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        match = self._registration.register(
-            scan_outline, advance(before, guess), turned @ spread @ turned.T, is_measured
-        )
+        spread = self._in_map(spread, float(before[2]), is_measured)
+        match = self._registration.register(scan_outline, advance(before, guess), spread, is_measured)
         step = relative_step(before, match.pose)
         x, y, heading = step.tolist()
         self._wheel_pose = scan.wheel_pose
         if match.fits:
             self._motion, self._held = step if seconds else step / periods, 0.0
             self._seconds = seconds or math.nan
+            if seconds:
+                self._velocities.append(step / seconds)
         else:
             self._held += passed
+        self._held_in_a_row = self._held_in_a_row + 1 if match.held.shape[1] else 0
+        self._held_directions = match.held
         notes = _describe_match(match, scan_outline)
         return Registered(Step(x, y, heading, match.step, match.noise), notes, match.fits)
 
@@ -141,6 +168,21 @@ class MatcherTracker:
         turn = least[1] + part * abs(float(guess[2])) + float(unknown[1])
         return guess, np.diag([distance**2, distance**2, turn**2]), is_measured
 
+    def _in_map(self, spread: FloatArray, heading: float, is_measured: bool) -> FloatArray:
+        """The covariance (3, 3) of a guess, of the laser's frame, in the map's.
+
+        Along what was held before, a motion that goes on errs alike every time: the error of n steps is n
+        times that of one, its variance n times n, to which the last step adds 2 n - 1.
+        """
+        cos, sin = math.cos(heading), math.sin(heading)
+        turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+        spread = turned @ spread @ turned.T
+        if self._held_in_a_row and not is_measured:
+            held = self._held_directions
+            along = np.einsum("ik,ij,jk->k", held, spread, held)
+            spread = spread + (2.0 * self._held_in_a_row) * (held * along) @ held.T
+        return spread
+
     def _find_outline(self, scan: Scan) -> Outline:
         """Points and lines of a scan, undistorted if wanted."""
         ranges = np.ascontiguousarray(scan.ranges, dtype=np.float64)
@@ -148,9 +190,12 @@ class MatcherTracker:
         if bearings is None:
             bearings = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
         limit = self._no_return.limit(ranges, FARTHEST)
-        if self.deskew and scan.times is not None and self._seconds > 0 and self._motion.any():
+        if self.deskew and scan.times is not None and self._velocities:
             ranges = np.where(ranges < limit, ranges, np.inf)
-            ranges, bearings = deskew(ranges, bearings, scan.times, self._motion / self._seconds)
+            # The mean of the last two: an error of the last step alone would come back in the next one
+            # with the opposite sign, and never end.
+            velocity = np.mean(self._velocities, axis=0)
+            ranges, bearings = deskew(ranges, bearings, scan.times, velocity)
             limit = FARTHEST
         found = outline(find_points(ranges, np.ascontiguousarray(bearings, dtype=np.float64), limit))
         self._returns = found.returns

@@ -131,9 +131,7 @@ class Clock:
         late = stamp - self._expected - scans * usual
         lost = max(0, round(min(late / usual, FOREVER)))
         self._expected = stamp - (1 - FOLLOWING) * (late - lost * usual)
-        return Tick(
-            1 + lost, seconds, notes=self._compare_pace(recent, max(middles, default=math.inf))
-        )
+        return Tick(1 + lost, seconds, notes=self._compare_pace(recent, max(middles, default=math.inf)))
 
     def _compare_pace(self, recent: float, most: float) -> tuple[str, ...]:
         """Words about another period than that of training, from the least and the greatest middle."""

@@ -81,14 +81,10 @@ def _score_model(chosen: Settings) -> tuple[Settings, Report]:
     datamodule = build_datamodule(chosen).load(("test",), encode=model.uses_depth_vectors)
     drives = datamodule.drives["test"]
     steps = {drive.name: model.estimate(drive) for drive in drives}
-    mean = mean_step(datamodule.open_recording, data["train"])
+    mean = mean_step(datamodule.open_recording, data["train"]) if data["train"] else None
     latency = _latency(model, drives[0])
     scores = report_drives(variant, steps, mean, latency, drives, data, Path(chosen["run_dir"]))
     metrics: Report = {"variant": variant, "data": data["name"], **scores}
-    if failures := getattr(model, "failures", None):  # of a model that counts them
-        each = (f"{count} of {len(steps[name])} on {name}" for name, count in failures.items())
-        log.info("%s: steps that failed, where the last motion goes on: %s", variant, ", ".join(each))
-        metrics["failures"] = failures
     settings = {key: value for key, value in chosen.items() if key not in ("run", "trainer")}
     return settings, metrics
 

@@ -59,8 +59,8 @@ class DataOptions:
     )
     sensor: Sensor
     augment: AugmentOptions
-    train: list[Any] = _names()  # noqa: RUF009
-    val: list[Any] = _names()  # noqa: RUF009
+    train: list[Any] | None = _names()  # noqa: RUF009
+    val: list[Any] | None = _names()  # noqa: RUF009
     test: list[Any] = _names()  # noqa: RUF009
     lengths: list[Any] = option(  # noqa: RUF009
         fits=_are_lengths, wanted="a list of lengths in metres, for instance [1,2,5]"
