@@ -91,12 +91,18 @@ def weakest_direction(aligned: Aligned) -> FloatArray | None:
 
     None where all are determined, or where it is the heading that is not.
     """
-    values, vectors = np.linalg.eigh(aligned.information)
-    along = vectors[:, 0]
-    if values[0] > HARDLY or abs(along[2]) > 0.7:
+    least, along = _weakest(aligned.information)
+    if least > HARDLY or abs(along[2]) > 0.7:
         return None
     direction: FloatArray = np.array([along[0], along[1], 0.0]) / np.hypot(along[0], along[1])
     return direction
+
+
+@compiled
+def _weakest(information):  # type: ignore[no-untyped-def]
+    """The least information and its direction (3,)."""
+    values, vectors = np.linalg.eigh(information)
+    return values[0], vectors[:, 0].copy()
 
 
 @compiled

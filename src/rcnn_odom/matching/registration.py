@@ -1,10 +1,11 @@
 """Where a laser is in the map of what it has seen lately: registration of one scan after the other."""
 
+import math
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from rcnn_odom.geometry import FloatArray, advance, relative_step, wrap_angle
+from rcnn_odom.geometry import FloatArray, advance, relative_step
 from rcnn_odom.matching import yaw
 from rcnn_odom.matching.align import Table, align, build_table
 from rcnn_odom.matching.covariance import (
@@ -19,7 +20,7 @@ from rcnn_odom.matching.outline import Outline
 
 FEWEST_POINTS = 6
 """Points without which a scan cannot be registered: three things that stand alone."""
-MOST_POINTS = 300
+MOST_POINTS = 250
 """Points of a scan that are aligned, every k-th in angular order."""
 VOXEL, MOST_WEIGHT = 0.1, 10.0
 """Metres, and scans whose mean a cell of the map is; see :class:`LocalMap`."""
@@ -156,7 +157,7 @@ class Registration:
         if found.fit < LEAST_SCORE:
             return self._lose(scan, guess, spread)
         pose, held, information = hold_undetermined(found, guess)
-        off = float(np.hypot(*(pose - guess)[:2])), abs(float(wrap_angle(pose[2] - guess[2])))
+        off = math.hypot(pose[0] - guess[0], pose[1] - guess[1]), abs(_wrap(pose[2] - guess[2]))
         is_sudden = self.knows_motion and (off[0] > SUDDEN or off[1] > SUDDEN_TURN)
         error = off[0] + GATE_TURN * off[1]
         fading = 0.0 if np.isinf(self._guess_error) else GATE_FADES * self._guess_error
@@ -229,13 +230,13 @@ class Registration:
     def _is_key(self, pose: FloatArray, share: float) -> bool:
         """Whether a scan adds something to the map."""
         step = relative_step(self._key_pose, pose)
-        away = max(float(np.hypot(step[0], step[1])) / KEY_DISTANCE, abs(float(step[2])) / KEY_TURN)
+        away = max(math.hypot(step[0], step[1]) / KEY_DISTANCE, abs(float(step[2])) / KEY_TURN)
         return away > 1 or (away > KEY_LEAST and share < KEY_SHARE)
 
     def _add(self, scan: Outline) -> None:
         """Adds a scan at the present pose to the map, which forgets what is too far back."""
         step = relative_step(self._key_pose, self.pose)
-        self._travelled += float(np.hypot(step[0], step[1]))
+        self._travelled += math.hypot(step[0], step[1])
         self._map.add(scan.points, scan.normals, self.pose, self._travelled)
         self._since = max(self._since, self._travelled - max(SHORTEST_MAP, MAP_LENGTH * scan.reach))
         self._added += 1
@@ -255,18 +256,23 @@ def _thin(scan: Outline) -> tuple[FloatArray, FloatArray]:
 
 def _penalty(pose: FloatArray, guess: FloatArray, is_other: bool) -> float:
     """Of a score, for what was reached from another start than the guess, or is far from it."""
-    away = float(np.hypot(pose[0] - guess[0], pose[1] - guess[1]))
+    away = math.hypot(pose[0] - guess[0], pose[1] - guess[1])
     start = START_PENALTY if is_other else 0.0
-    return start + AWAY_PENALTY * min(away, 3.0) + TURN_PENALTY * abs(float(wrap_angle(pose[2] - guess[2])))
+    return start + AWAY_PENALTY * min(away, 3.0) + TURN_PENALTY * abs(_wrap(pose[2] - guess[2]))
 
 
 def _is_rival(other: Aligned, best: Aligned) -> bool:
     """Whether another place fits a scan nearly as well as the best one."""
     step = relative_step(best.pose, other.pose)
-    is_elsewhere = float(np.hypot(step[0], step[1])) > ELSEWHERE or abs(float(step[2])) > ELSEWHERE_TURN
+    is_elsewhere = math.hypot(step[0], step[1]) > ELSEWHERE or abs(float(step[2])) > ELSEWHERE_TURN
     return is_elsewhere and other.score > NEARLY * best.score
 
 
 def _stiffness(spread: FloatArray) -> FloatArray:
     """The pull (3, 3) of a measured guess, beside a mean square of 1 of a full scan's residuals' change."""
     return WEAK_PRIOR + np.linalg.inv(spread) * POINT_ERROR**2 * CORRELATED / MOST_POINTS
+
+
+def _wrap(angle: float) -> float:
+    """An angle in radians, brought into [-pi, pi)."""
+    return (float(angle) + math.pi) % (2 * math.pi) - math.pi

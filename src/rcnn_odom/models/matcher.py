@@ -150,22 +150,23 @@ class MatcherTracker:
             scan: the next one.
             passed: how often the last motion fits into the time since the last scan.
         """
-        unknown = np.zeros(2)
+        longer = 0.0
         if self.wheels and scan.wheel_pose is not None and self._wheel_pose is not None:
             guess = relative_step(np.array(self._wheel_pose), np.array(scan.wheel_pose))
             least, part = (WHEELS_DISTANCE, WHEELS_TURN), SLIP
             is_measured = True
         else:
-            guess, share = np.zeros(3), max(0.0, min(passed, LONGEST_HOLD - self._held))
-            whole = int(share)
+            share = max(0.0, min(passed, LONGEST_HOLD - self._held))
+            guess, whole = (share % 1.0) * self._motion, int(share)
             for _ in range(whole):
-                guess = advance(guess, self._motion)
-            guess = advance(guess, (share - whole) * self._motion)
+                guess = advance(self._motion, guess)
             least, part, is_measured = (GUESS_DISTANCE * passed, GUESS_TURN * passed), 0.5, False
-            # Whether it goes on for longer than that is not known.
-            unknown = (passed - share) * np.abs([np.hypot(*self._motion[:2]), self._motion[2]])
-        distance = least[0] + part * float(np.hypot(guess[0], guess[1])) + float(unknown[0])
-        turn = least[1] + part * abs(float(guess[2])) + float(unknown[1])
+            longer = passed - share  # whether it goes on for longer than that is not known
+        x, y, heading = guess.tolist()
+        distance, turn = least[0] + part * math.hypot(x, y), least[1] + part * abs(heading)
+        if longer:
+            x, y, heading = self._motion.tolist()
+            distance, turn = distance + longer * math.hypot(x, y), turn + longer * abs(heading)
         return guess, np.diag([distance**2, distance**2, turn**2]), is_measured
 
     def _in_map(self, spread: FloatArray, heading: float, is_measured: bool) -> FloatArray:
