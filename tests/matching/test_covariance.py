@@ -3,7 +3,14 @@
 import numpy as np
 import pytest
 
-from rcnn_odom.matching.covariance import DRIFTS, Aligned, Uncertainty, hold_undetermined, weakest_direction
+from rcnn_odom.matching.covariance import (
+    CORRELATED,
+    DRIFTS,
+    Aligned,
+    Uncertainty,
+    hold_undetermined,
+    weakest_direction,
+)
 
 
 def spread(rng, size):
@@ -89,7 +96,7 @@ def test_what_is_determined_stands_as_it_was_found():
     assert held.shape == (3, 0)
     np.testing.assert_allclose(pose, aligned.pose, atol=1e-3)
     # About n / variance, but less for what is weak: half of it where WEAK_INFORMATION is all there is.
-    np.testing.assert_allclose(np.diag(told), 200 / 1e-4 * np.array([0.5, 0.5, 4.0]), rtol=0.07)
+    np.testing.assert_allclose(np.diag(told), 200 / CORRELATED / 1e-4 * np.array([0.5, 0.5, 4.0]), rtol=0.07)
     assert weakest_direction(aligned) is None
 
 

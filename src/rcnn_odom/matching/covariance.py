@@ -22,11 +22,11 @@ HARDLY_TURNS = 0.1
 """Radians a metre: a direction that is held along with less than that of a turn is one of the plane."""
 MAP_ERROR = 0.006
 """Metres: the error of a point of the map in addition to the scatter of a scan."""
-CORRELATED = 1.0
+CORRELATED = 1.1
 """Points that share one error, as neighbours on a wall share those of the wall and its line. Fitted."""
-DRIFTS = np.array([1.5, 0.5])
-"""Variance by which a map that moves along drifts per metre and per radian, over the variance of a match.
-Fitted."""
+DRIFTS = np.array([8.0, 0.5])
+"""Variance by which a map that moves along drifts per median range of the way and per radian, over that of a
+match. Fitted."""
 
 
 class Aligned(NamedTuple):
@@ -61,7 +61,7 @@ class Aligned(NamedTuple):
         """Of what :func:`rcnn_odom.matching.align.align` gives for ``aligned`` points of a scan."""
         information = found[:3] - max(scan.normal_noise, LEAST_NORMAL_NOISE**2) * found[3:6]
         square = float(np.sqrt(found[6, 1] * scan.scatter)) + MAP_ERROR**2
-        weight = float(found[6, 0]) * float(np.sqrt(len(scan.points) / aligned))
+        weight = float(found[6, 0]) * len(scan.points) / aligned
         return cls(pose, score, fit, information, weight, square, float(found[6, 2]))
 
 
@@ -143,7 +143,12 @@ class Uncertainty:
         self.pose = np.zeros((3, 3))
 
     def update(
-        self, before: FloatArray, after: FloatArray, guess: FloatArray, information: FloatArray
+        self,
+        before: FloatArray,
+        after: FloatArray,
+        guess: FloatArray,
+        information: FloatArray,
+        reach: float = 1.0,
     ) -> tuple[FloatArray, FloatArray]:
         """One match more.
 
@@ -151,12 +156,13 @@ class Uncertainty:
             before, after: poses (3,) in the map's frame.
             guess: (3, 3) covariance of the guessed step in the map's frame.
             information: (3, 3) of the match on the later pose, in the map's frame; 0 where there is none.
+            reach: median range of the scan in metres, by which the map's length goes.
 
         Returns:
             Covariances (3, 3) of the step, in the frame of the earlier pose, and of the part of its error
             that the next step takes back, G m, in the frame of the later pose.
         """
-        self.pose, step, noise = _update(self.pose, before, after, guess, information, DRIFTS)
+        self.pose, step, noise = _update(self.pose, before, after, guess, information, DRIFTS / [reach, 1.0])
         return step, noise
 
 

@@ -165,7 +165,9 @@ class Registration:
         before, self.pose = self.pose, pose
         if self._is_key(pose, found.share):
             self._add(scan)
-        covariances = self._uncertainty.update(before, pose, spread, information)
+        covariances = self._uncertainty.update(
+            before, pose, spread, information, max(scan.reach, SHORTEST_MAP)
+        )
         return Match(
             *(pose, *covariances, held),
             is_poor=found.fit < GOOD_SCORE,
