@@ -192,6 +192,8 @@ class AccumulatedCovariance:
 
     def add(self, pose: FloatArray, step: Step) -> None:
         """One more step, from this pose, x, y and heading (3,)."""
+        if not (step.covariance.any() or step.array().any()):
+            return  # a scan that was passed over: nothing has happened
         lasting = step.covariance
         if self._open.any() or step.taken_back.any():
             before = _carry(_lever(step.x, step.y), self._open)

@@ -78,7 +78,7 @@ def test_in_a_corridor_the_guess_stands_along_it():
     information[2, 2] = 4.0
     aligned = match_with(information)
     guess = np.array([1.0, 0.7, 0.05])
-    pose, held, told = hold_undetermined(aligned, guess)
+    pose, held, told = hold_undetermined(aligned, guess, np.eye(3))
     assert held.shape == (3, 1)
     assert abs(held[:2, 0] @ along) == pytest.approx(1.0, abs=1e-6)
     off = aligned.pose - guess
@@ -92,7 +92,7 @@ def test_in_a_corridor_the_guess_stands_along_it():
 
 def test_what_is_determined_stands_as_it_was_found():
     aligned = match_with(np.diag([0.5, 0.5, 4.0]), pose=(0.3, 0.2, 0.1 + 2 * np.pi))
-    pose, held, told = hold_undetermined(aligned, np.zeros(3))
+    pose, held, told = hold_undetermined(aligned, np.zeros(3), np.eye(3))
     assert held.shape == (3, 0)
     np.testing.assert_allclose(pose, aligned.pose, atol=1e-3)
     # About n / variance, but less for what is weak: half of it where WEAK_INFORMATION is all there is.
@@ -102,7 +102,7 @@ def test_what_is_determined_stands_as_it_was_found():
 
 def test_in_a_round_room_the_heading_is_held():
     aligned = match_with(np.diag([0.5, 0.5, 0.0]))
-    pose, held, _ = hold_undetermined(aligned, np.zeros(3))
+    pose, held, _ = hold_undetermined(aligned, np.zeros(3), np.eye(3))
     np.testing.assert_allclose(np.abs(held[:, 0]), [0, 0, 1])
     np.testing.assert_allclose(pose, [0.3, 0.2, 0.0], atol=1e-3)
     assert weakest_direction(aligned) is None

@@ -104,9 +104,8 @@ class Odometer:
 
     def __init__(self, tracker: ScanTracker | None = None, laser_pose: LaserPose | None = None) -> None:
         if tracker is None:
-            from rcnn_odom.models.matcher import (
-                MatcherTracker,
-            )  # compiled code, for which networks need not wait
+            # Compiled code, which networks do not need.
+            from rcnn_odom.models.matcher import MatcherTracker
 
             tracker = MatcherTracker()
         self.tracker, self.laser_pose = tracker, laser_pose

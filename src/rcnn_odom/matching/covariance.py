@@ -38,7 +38,7 @@ class Aligned(NamedTuple):
         fit: the same of the points on lines, if there are enough of them.
         information: (3, 3) on x, y and heading in the map's frame, a mean over the pairs, without what errors
             of normals feign.
-        weight: sum of the pairs' weights, multiplied by the square root of the scan's points over those that
+        weight: sum of the pairs' weights, multiplied by the scan's points over those that
             were aligned: points that were left out have helped to fit the lines.
         square: square metres, the variance of a point: the geometric mean of the mean square of the
             residuals, which is too small since lines smooth, and of the scatter of the returns about their
@@ -60,12 +60,15 @@ class Aligned(NamedTuple):
     ) -> "Aligned":
         """Of what :func:`rcnn_odom.matching.align.align` gives for ``aligned`` points of a scan."""
         information = found[:3] - max(scan.normal_noise, LEAST_NORMAL_NOISE**2) * found[3:6]
-        square = float(np.sqrt(found[6, 1] * scan.scatter)) + MAP_ERROR**2
+        scatter = scan.scatter if scan.lines else found[6, 1]
+        square = float(np.sqrt(found[6, 1] * scatter)) + MAP_ERROR**2
         weight = float(found[6, 0]) * len(scan.points) / aligned
         return cls(pose, score, fit, information, weight, square, float(found[6, 2]))
 
 
-def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, FloatArray, FloatArray]:
+def hold_undetermined(
+    aligned: Aligned, guess: FloatArray, spread: FloatArray
+) -> tuple[FloatArray, FloatArray, FloatArray]:
     """Puts the guess in place of the match along what the scan does not determine.
 
     Zhang, Kaess and Singh, "On Degeneracy of Optimization-based State Estimation Problems", ICRA 2016; but
@@ -81,7 +84,7 @@ def hold_undetermined(aligned: Aligned, guess: FloatArray) -> tuple[FloatArray, 
         map's frame.
     """
     pose, directions, share, information = _hold(
-        aligned.pose, guess, aligned.information, aligned.weight / (CORRELATED * aligned.square)
+        aligned.pose, guess, spread, aligned.information, aligned.weight / (CORRELATED * aligned.square)
     )
     return pose, directions[:, share > 0.5], information
 
@@ -106,7 +109,7 @@ def _weakest(information):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
+def _hold(pose, guess, spread, information, of_all):  # type: ignore[no-untyped-def]
     """The held pose, the directions (3, 3), the share of the guess in each, and the match's information."""
     strengths, directions = np.linalg.eigh(information)
     strengths = np.maximum(strengths, 0.0)
@@ -115,6 +118,11 @@ def _hold(pose, guess, information, of_all):  # type: ignore[no-untyped-def]
     off[2] = (off[2] + np.pi) % (2 * np.pi) - np.pi
     held = pose - directions @ (share * (directions.T @ off))
     strengths = of_all * strengths * strengths / (strengths + WEAK_INFORMATION)
+    for k in range(3):
+        # Of the guess's error its share stays, whatever the match says of itself.
+        stays = share[k] ** 2 * (directions[:, k] @ spread @ directions[:, k].copy())
+        if strengths[k] * stays > 1:
+            strengths[k] = 1 / stays
     weighed = (directions * strengths) @ directions.T
     for k in range(3):
         # A wall that is not quite straight feigns that the heading is held a little with the way along it.

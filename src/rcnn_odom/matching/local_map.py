@@ -18,7 +18,7 @@ class LocalMap:
 
     Args:
         voxel: metres.
-        most_weight: scans after which a cell's mean follows new points by a constant share.
+        most_weight: points after which a cell's mean follows new points by a constant share.
     """
 
     def __init__(self, voxel: float, most_weight: float) -> None:

@@ -24,21 +24,21 @@ class NoReturn:
 
     def limit(self, ranges: FloatArray, farthest: float) -> float:
         """Metres at or beyond which a reading of this scan (P,) is no return, at most ``farthest``."""
-        return min(farthest, _learn(ranges, self._state))
+        return min(farthest, _learn(ranges, farthest, self._state))
 
 
 @compiled
-def _learn(ranges, state):  # type: ignore[no-untyped-def]
+def _learn(ranges, farthest, state):  # type: ignore[no-untyped-def]
     """Counts the readings of a scan; returns the limit in metres, inf if there is none yet."""
     largest = state[0]
     for i in range(len(ranges)):
-        if ranges[i] > largest and ranges[i] < np.inf:
+        if ranges[i] > largest and ranges[i] < farthest:
             largest = ranges[i]
     if largest * TOP > state[0]:
         state[1], state[2] = 0, 0
     state[0] = largest
     for i in range(len(ranges)):
-        if ranges[i] >= TOP * largest and ranges[i] < np.inf:
+        if ranges[i] >= TOP * largest and ranges[i] < farthest:
             state[1] += 1
         elif BELOW * largest <= ranges[i] < TOP * largest:
             state[2] += 1

@@ -73,6 +73,8 @@ def outline(found: FloatArray) -> Outline:
     lines = count
     if lines < FEW_LINES:
         count = _add_things(found, points, normals, lines)
+    if not lines and count:
+        about[2] = float(np.median(np.hypot(*points[:count].T)))
     return Outline(points[:count], normals[:count], found[:, :2], lines, *about)
 
 

@@ -23,7 +23,7 @@ FEWEST_POINTS = 6
 MOST_POINTS = 250
 """Points of a scan that are aligned, every k-th in angular order."""
 VOXEL, MOST_WEIGHT = 0.1, 10.0
-"""Metres, and scans whose mean a cell of the map is; see :class:`LocalMap`."""
+"""Metres, and points whose mean a cell of the map is; see :class:`LocalMap`."""
 MAP_LENGTH, SHORTEST_MAP = 2.0, 1.5
 """The length of the way that the map remembers, in median ranges of a scan, and at least in metres. A longer
 one would hold on to old errors; a shorter one would lose what has left the field of view."""
@@ -142,21 +142,25 @@ class Registration:
         if not self.is_empty:
             self._add(scan)
 
-    def register(self, scan: Outline, guess: FloatArray, spread: FloatArray, trust: bool = False) -> Match:
+    def register(
+        self, scan: Outline, guess: FloatArray, spread: FloatArray, is_measured: bool = False
+    ) -> Match:
         """The pose of one more scan.
 
         Args:
             scan: its points and normals.
             guess: (3,) pose in the map's frame.
             spread: (3, 3) covariance of the guess in the map's frame.
-            trust: the guess is a measurement, that pulls by its covariance; otherwise it pulls weakly.
+            is_measured: the guess is a measurement, that pulls by its covariance; otherwise it pulls weakly.
         """
         if len(scan.points) < FEWEST_POINTS:
             return self._lose(scan, guess, spread)
-        found, has_rival = self._search(scan, guess, _stiffness(spread) if trust else WEAK_PRIOR)
+        found, has_rival = self._search(
+            scan, guess, _stiffness(spread, len(scan.points)) if is_measured else WEAK_PRIOR
+        )
         if found.fit < LEAST_SCORE:
             return self._lose(scan, guess, spread)
-        pose, held, information = hold_undetermined(found, guess)
+        pose, held, information = hold_undetermined(found, guess, spread)
         off = math.hypot(pose[0] - guess[0], pose[1] - guess[1]), abs(_wrap(pose[2] - guess[2]))
         is_sudden = self.knows_motion and (off[0] > SUDDEN or off[1] > SUDDEN_TURN)
         error = off[0] + GATE_TURN * off[1]
@@ -200,8 +204,9 @@ class Registration:
         if not starts:
             return best, False
         found_all = [best, *(align_from(*start) for start in starts)]
+        first = best
         # What is nearer to the guess is preferred, so that a twin must fit better by more than chance.
-        best = max(found_all, key=lambda other: other.score - _penalty(other.pose, guess, other is not best))
+        best = max(found_all, key=lambda other: other.score - _penalty(other.pose, guess, other is not first))
         return best, any(_is_rival(other, best) for other in found_all)
 
     def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[tuple[FloatArray, float]]:
@@ -213,7 +218,7 @@ class Registration:
         starts.append((self.pose, WIDE_GATE))
         turns = TURNS if len(scan.points) >= FEWEST_FOR_TURNS else 0
         for turn in yaw.turn_candidates(self._key_normals, scan.normals, turns):
-            heading = self._key_pose[2] + turn
+            heading = guess[2] + _wrap(self._key_pose[2] + turn - guess[2])
             starts += [(np.array([x, y, heading]), WIDE_GATE) for x, y in (guess[:2], self.pose[:2])]
         ahead = np.array([self.pose[0], self.pose[1], guess[2]])
         shifts, gate = (SHIFTS, NEAR_GATE) if self.knows_motion else (FIRST_SHIFTS, WIDE_GATE)
@@ -270,9 +275,9 @@ def _is_rival(other: Aligned, best: Aligned) -> bool:
     return is_elsewhere and other.score > NEARLY * best.score
 
 
-def _stiffness(spread: FloatArray) -> FloatArray:
+def _stiffness(spread: FloatArray, points: int) -> FloatArray:
     """The pull (3, 3) of a measured guess, beside a mean square of 1 of a full scan's residuals' change."""
-    return WEAK_PRIOR + np.linalg.inv(spread) * POINT_ERROR**2 * CORRELATED / MOST_POINTS
+    return WEAK_PRIOR + np.linalg.inv(spread) * POINT_ERROR**2 * CORRELATED / points
 
 
 def _wrap(angle: float) -> float:

@@ -38,7 +38,6 @@ class Model(ABC):
         uses_depth_vectors: whether it looks at ``Drive.scans``, which are not made for it otherwise.
         deskew: ``data.deskew``, for a model of whole scans: whether it takes the motion of the laser within a
             scan out of it, ``on`` or ``off``; ``auto``: unless ``Drive.is_compensated``.
-        deskew: whether a model of whole scans undistorts them: ``on``, ``off`` or, by the drive, ``auto``.
     """
 
     name: ClassVar[str]

@@ -4,11 +4,11 @@ import math
 from collections import deque
 from dataclasses import dataclass
 from functools import cache
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import numpy as np
 
-from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_step
+from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_step, turn_to_middle
 from rcnn_odom.matching.deskew import deskew
 from rcnn_odom.matching.local_map import LocalMap
 from rcnn_odom.matching.no_return import NoReturn
@@ -16,7 +16,6 @@ from rcnn_odom.matching.outline import Outline, outline
 from rcnn_odom.matching.points import find_points
 from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
 from rcnn_odom.models.contract import Model
-from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.streaming import Registered
 from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.recordings.recording import Drive
@@ -128,10 +127,11 @@ class MatcherTracker:
         x, y, heading = step.tolist()
         self._wheel_pose = scan.wheel_pose
         if match.fits:
-            self._motion, self._held = step if seconds else step / periods, 0.0
-            self._seconds = seconds or math.nan
+            self._motion, self._held = step / periods, 0.0
+            self._seconds = seconds / periods if seconds else math.nan
             if seconds:
-                self._velocities.append(step / seconds)
+                in_own_frame = turn_to_middle(Step(x, y, heading)).array()
+                self._velocities.append(in_own_frame / seconds)
         else:
             self._held += passed
         self._held_in_a_row = self._held_in_a_row + 1 if match.held.shape[1] else 0
@@ -190,15 +190,17 @@ class MatcherTracker:
         bearings = scan.bearings
         if bearings is None:
             bearings = np.linspace(-np.pi, np.pi, len(ranges), endpoint=False)
+        bearings = np.ascontiguousarray(bearings, dtype=np.float64)
         limit = self._no_return.limit(ranges, FARTHEST)
         if self.deskew and scan.times is not None and self._velocities:
+            times = np.ascontiguousarray(scan.times, dtype=np.float64)
             ranges = np.where(ranges < limit, ranges, np.inf)
             # The mean of the last two: an error of the last step alone would come back in the next one
             # with the opposite sign, and never end.
             velocity = np.mean(self._velocities, axis=0)
-            ranges, bearings = deskew(ranges, bearings, scan.times, velocity)
+            ranges, bearings = deskew(ranges, bearings, times, velocity)
             limit = FARTHEST
-        found = outline(find_points(ranges, np.ascontiguousarray(bearings, dtype=np.float64), limit))
+        found = outline(find_points(ranges, bearings, limit))
         self._returns = found.returns
         return found
 
@@ -251,10 +253,6 @@ class Matcher(Model):
     name = "matcher"
     Options = MatcherOptions
     uses_depth_vectors: ClassVar[bool] = False
-
-    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
-        super().__init__(options, sensor)
-        self.deskew = "auto"
 
     def tracker(self) -> MatcherTracker:
         """The same in a stream."""

@@ -138,7 +138,7 @@ class PeerTracker:
             if not np.isfinite(pose).all():
                 raise ValueError("its pose is not finite")
         except Exception as error:  # whatever the code of another project does
-            self._aligner, self._pose = self._peer.aligner(), np.eye(4)
+            self._aligner, self._pose, self._has_seen = self._peer.aligner(), np.eye(4), False
             note = f"error: {self._peer.name}: {type(error).__name__}: {error}"
             return Registered(self._last, (note,), is_estimated=False)
         step = poses_to_planar((np.linalg.inv(self._pose) @ pose)[None])[0]

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
+import numpy.typing as npt
 
 from rcnn_odom.evaluation.drift import travelled
 from rcnn_odom.evaluation.metrics import Report, planar_drift
@@ -30,12 +31,12 @@ class Timed:
     Attributes:
         steps: N - 1 of them.
         milliseconds: (N-1,) that each took, from the scan to the step.
-        errors: how many scans the method could not take.
+        errors: (N-1,) which scans but the first the method could not take.
     """
 
     steps: Steps
     milliseconds: FloatArray
-    errors: int
+    errors: npt.NDArray[np.bool_]
 
 
 @contextmanager
@@ -63,7 +64,7 @@ def run_timed(tracker: ScanTracker, loaded: LoadedSet) -> Timed:
         start = time.perf_counter()
         found.append(tracking.step(scan))
         milliseconds.append(1e3 * (time.perf_counter() - start))
-    errors = sum(note.startswith("error:") for tracked in found for note in tracked.notes)
+    errors = np.array([any(note.startswith("error:") for note in each.notes) for each in found[1:]])
     values = np.array([tracked.step.array() for tracked in found[1:]])
     covariances = np.array([tracked.step.covariance for tracked in found[1:]])
     return Timed(Steps(values, covariances), np.array(milliseconds[1:]), errors)
@@ -92,8 +93,8 @@ def score_timed(timed: Timed, loaded: LoadedSet) -> Report:
         "segments": drift.segments,
         "median_ms": median,
         "p99_ms": p99,
-        "failures": int(off.sum()) + timed.errors,
-        "errors": timed.errors,
+        "failures": int((off | timed.errors).sum()),
+        "errors": int(timed.errors.sum()),
         "path_ratio": path_ratio(timed.steps, drive),
     }
     if options["frames"]:

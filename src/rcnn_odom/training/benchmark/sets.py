@@ -91,7 +91,7 @@ def load_sets(sets: dict[str, Settings]) -> dict[str, LoadedSet]:
             continue
         loaded[name] = _load(json.dumps(options))
     if not loaded:
-        raise InputError("benchmark.recordings: none of the sets is there; give the folder of the recordings")
+        raise InputError("benchmark.root: none of the sets is there; give the folder of the recordings")
     return loaded
 
 
