@@ -69,7 +69,7 @@ def test_the_package_is_the_installed_one(call, installed):
 
 
 def test_the_shipped_network_runs_and_is_scored(call, drives, tmp_path):
-    call(*command("run", "rcnn_small", drives / "sequences" / "05", "--out", tmp_path / "out"))
+    call(*command("run", drives / "sequences" / "05", "--model", "rcnn_small", "--out", tmp_path / "out"))
     trajectory = tmp_path / "out" / "trajectory.txt"
     assert np.loadtxt(trajectory).shape == (60, 12)
     options = ("--planar", "--lengths", "10,20", "--json")
@@ -83,6 +83,8 @@ def test_a_run_is_exported_and_the_file_runs(call, drives, tmp_path):
     data = [f"data.root={drives}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
     call(ROOT / "train.py", "model=cnn_reg", *SMALL, FINE, *data, f"outputs={run.parent}", f"run_dir={run}")
     call(*command("export", run))
-    call(*command("run", run / "model.onnx", drives / "sequences" / "05", "--out", tmp_path / "out"))
+    call(
+        *command("run", drives / "sequences" / "05", "--model", run / "model.onnx", "--out", tmp_path / "out")
+    )
     offline = np.loadtxt(run / "trajectories" / "05.txt")
     np.testing.assert_allclose(np.loadtxt(tmp_path / "out" / "trajectory.txt"), offline, atol=1e-3)

@@ -443,7 +443,7 @@ def test_configuration(root: Path, configure) -> None:
     drives = [f"data.train=[{NAME}]", f"data.test=[{NAME}]", "data.workers=1"]
     where = ["data=kitti_raw", f"data.root={root}"]
     for options, says in (
-        (where, "data.train=None: must be a list of sequences"),
+        (where, "data.test=None: must be a list of sequences"),
         (["data=kitti_raw", *drives[:2]], "data.root is missing"),
         ([*where, *drives, "data.ring=-1"], "data.ring=-1: must be null or a whole"),
     ):

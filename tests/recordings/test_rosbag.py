@@ -56,7 +56,7 @@ def test_a_bag_gives_its_scans(tmp_path, kind):
     assert (len(scans), stream.total, stream.has_clock) == (12, 12, True)
     np.testing.assert_allclose([scan.stamp for scan in scans], START + 0.1 * np.arange(12), atol=1e-6)
     np.testing.assert_array_equal(scans[3].ranges[:5], [0, np.inf, np.inf, np.inf, 0])
-    np.testing.assert_allclose(scans[2].times, 0.1 / 360 * np.arange(181), rtol=1e-6)
+    assert (scans[2].times, scans[2].turn_time) == (None, pytest.approx(0.1))
     np.testing.assert_allclose(scans[3].times, 1e-4 * np.arange(181), rtol=1e-6)
     assert {scan.frame_id for scan in scans} == {"laser"}
     np.testing.assert_allclose(np.rad2deg(scans[0].bearings), np.arange(-90, 91), atol=1e-4)
