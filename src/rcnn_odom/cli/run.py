@@ -251,8 +251,9 @@ def _print_pose(pose: "Pose") -> None:
 
 def _build_matcher(arguments: argparse.Namespace, stream: "ScanStream") -> "ScanTracker":
     from rcnn_odom.models.matcher import MatcherTracker
+    from rcnn_odom.recordings.recording import wants_deskew
 
-    deskew = {"on": True, "off": False}.get(arguments.deskew, not stream.is_compensated)
+    deskew = wants_deskew(arguments.deskew or "auto", stream.is_compensated)
     return MatcherTracker(wheels=bool(arguments.wheels or arguments.odom_topic), deskew=deskew)
 
 

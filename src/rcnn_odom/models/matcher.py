@@ -18,7 +18,7 @@ from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
 from rcnn_odom.models.contract import Model
 from rcnn_odom.models.streaming import Registered
 from rcnn_odom.models.tracking import estimate_by_tracking
-from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.recordings.recording import Drive, wants_deskew
 from rcnn_odom.recordings.scan import Scan
 
 FARTHEST = 120.0
@@ -260,5 +260,5 @@ class Matcher(Model):
 
     def estimate(self, drive: Drive) -> Steps:
         """The steps of one whole drive, those that ``rcnn-odom run`` gives."""
-        undistorted = not drive.is_compensated if self.deskew == "auto" else self.deskew == "on"
-        return estimate_by_tracking(MatcherTracker(deskew=undistorted, **self.options), drive.raw_scans())
+        deskew = wants_deskew(self.deskew, drive.is_compensated)
+        return estimate_by_tracking(MatcherTracker(deskew=deskew, **self.options), drive.raw_scans())

@@ -16,6 +16,16 @@ OpenRecording = Callable[[str], "Recording"]
 """Name -> the recording; picklable, since encoding runs in processes."""
 
 
+def wants_deskew(choice: str, is_compensated: bool) -> bool:
+    """Whether scans are to be undistorted.
+
+    Args:
+        choice: ``on``, ``off``, or ``auto``: unless the recording is compensated already.
+        is_compensated: as of :class:`Recording`.
+    """
+    return choice == "on" or (choice == "auto" and not is_compensated)
+
+
 @dataclass(frozen=True)
 class Recording:
     """One drive: scans in file order with the truth about where each was taken.

@@ -13,7 +13,7 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.options import check_options, option
 from rcnn_odom.recordings.formats import open_recording
 from rcnn_odom.recordings.parts import cut, parse_part
-from rcnn_odom.recordings.recording import Drive, Recording
+from rcnn_odom.recordings.recording import Drive, Recording, wants_deskew
 from rcnn_odom.recordings.scan import Scan
 
 log = logging.getLogger(__name__)
@@ -65,10 +65,7 @@ class LoadedSet:
     @property
     def deskew(self) -> str:
         """Whether scans are undistorted, ``on`` or ``off``."""
-        wanted: str = self.options["deskew"]
-        if wanted != "auto":
-            return wanted
-        return "off" if self.drive.is_compensated else "on"
+        return "on" if wants_deskew(self.options["deskew"], self.drive.is_compensated) else "off"
 
     @property
     def sensor(self) -> Sensor:
