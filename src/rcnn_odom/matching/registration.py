@@ -121,11 +121,6 @@ class Registration:
 
     def __init__(self) -> None:
         self._map = LocalMap(VOXEL, MOST_WEIGHT)
-        self.reset()
-
-    def reset(self) -> None:
-        """Forgets the map; the next scan is at the origin."""
-        self._map.clear()
         self.pose, self.is_empty, self.knows_motion = np.zeros(3), True, False
         self._key_pose, self._key_normals = np.zeros(3), np.empty((0, 2))
         self._travelled, self._since, self._added, self._lost = 0.0, 0.0, 0, 0
