@@ -1,8 +1,9 @@
 """Drives through generated worlds, seen by a 2D laser: no download, and never the same world twice.
 
 ``street`` is a car with one ring of an HDL-64 in a city, its motion like KITTI's; ``indoor`` is a robot with
-a level scanner in a building. A name stands for a world and a drive of its own, so ``05`` is always the same
-drive, but it has nothing in common with KITTI's 05 except its name and, in full scale, its length.
+a level scanner in a building; ``blind`` are places where the walls tell little of the way. A name stands for
+a world and a drive of its own, so ``05`` is always the same drive, but it has nothing in common with KITTI's
+05 except its name and, in full scale, its length.
 """
 
 import hashlib
@@ -20,6 +21,7 @@ from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.simulation import worlds
 from rcnn_odom.simulation.beams import EvenBeams
+from rcnn_odom.simulation.blind.drive import kind_of
 from rcnn_odom.simulation.kinds import LaserOptions, choose_laser
 from rcnn_odom.simulation.laser import Laser, hdl64_ring, scanner
 from rcnn_odom.simulation.street.city import Roads
@@ -32,7 +34,7 @@ VERSION = 4
 LIBRARIES = [(name, version(name)) for name in ("numpy", "scipy", "numba")]
 """Another version of these may draw other numbers from the same seed."""
 
-World = Literal["street", "indoor", "corridor", "few_returns", "standstill", "standstill_street"]
+World = Literal["street", "indoor", "corridor", "few_returns", "standstill", "standstill_street", "blind"]
 Scale = Literal["small", "full"]
 
 KITTI_FRAMES = dict(
@@ -51,6 +53,8 @@ FRAMES: dict[str, dict[str, int]] = {
 }
 DEFAULT_FRAMES = 600
 """Of a drive with another name."""
+BLIND_FRAMES = 1800
+"""Of a drive of ``blind`` in either scale: three minutes, in which also a robot comes 100 m far."""
 
 SENSORS: dict[str, dict[str, Any]] = {
     "street": {},
@@ -82,7 +86,7 @@ class RealismOptions:
 
 @dataclass(kw_only=True)
 class Options:
-    """What ``conf/data/simulated.yaml`` and ``indoor.yaml`` set beside what all recordings have."""
+    """What ``conf/data/simulated.yaml``, ``indoor.yaml`` and ``blind.yaml`` set beside what all data have."""
 
     realism: RealismOptions
     fresh_worlds: bool
@@ -121,9 +125,11 @@ def load(
             other drives in other worlds, each as long as ``NAME``.
         sensor: ``resolution_deg``, ``field_of_view_deg`` and ``max_range`` in metres; the others are
             KITTI's, or indoors a SICK's. With a ``laser`` it says nothing of that.
-        world: ``street`` or ``indoor``; or a special case that lasts a minute: ``corridor`` (two bare walls
-            without an end), ``few_returns`` (a plain with some posts), ``standstill`` (a robot at rest in a
-            building) and ``standstill_street`` (a parked car, without traffic).
+        world: ``street`` or ``indoor``; ``blind``, whose names begin with the kind of place: ``tunnel-``,
+            ``corridor-`` or ``posts-`` (see :mod:`rcnn_odom.simulation.blind.drive`); or a special case that
+            lasts a minute: ``corridor`` (two bare walls without an end), ``few_returns`` (a plain with some
+            posts), ``standstill`` (a robot at rest in a building) and ``standstill_street`` (a parked car,
+            without traffic).
         scale: by which ``FRAMES`` says how long the drive of a name is.
         frames: its length whatever its name; None: by scale and name.
         seed: chooses the set of worlds, 0 or more.
@@ -148,6 +154,8 @@ def load(
     """
     _check(name, world, scale, frames, seed)
     _check_rates(name, world, turn_rate_deg_s, scan_rate_hz)
+    if world == "blind":
+        kind_of(name)
     length = frames or _length(name, world, scale, scan_rate_hz)
     other_paces = vary_pace and world == "street" and "~" in name
     recipe = Recipe(name, seed, world, length, movers, tilt, other_paces, turn_rate_deg_s, scan_rate_hz)
@@ -172,6 +180,8 @@ def _without_none(items: list[tuple[str, Any]]) -> dict[str, Any]:
 
 def _length(name: str, world: str, scale: str, scan_rate_hz: float | None) -> int:
     """Frames of a drive."""
+    if world == "blind":
+        return BLIND_FRAMES
     if world in ("street", "indoor"):
         return FRAMES[scale].get(name.split("~")[0], DEFAULT_FRAMES)
     return round(MINUTE * (scan_rate_hz or MINUTE_RATE)) + 1

@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from rcnn_odom.geometry import FloatArray, planar_to_poses
+from rcnn_odom.simulation.blind.drive import BlindDrive, blind_drive, kind_of
 from rcnn_odom.simulation.indoor.building import Building, plan_building
 from rcnn_odom.simulation.indoor.people import populate
 from rcnn_odom.simulation.indoor.robot import random_walk
@@ -21,9 +22,9 @@ from rcnn_odom.simulation.street.street import build_streets
 from rcnn_odom.simulation.street.traffic import build_traffic
 from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground, stand
 
-WORLDS = ("street", "indoor", "corridor", "few_returns", "standstill", "standstill_street")
+WORLDS = ("street", "indoor", "corridor", "few_returns", "standstill", "standstill_street", "blind")
 MINUTE_RATE = 10.0
-"""Scans a second of the drives that last a minute: all but ``street`` and ``indoor``."""
+"""Scans a second of all drives but those of ``street`` and ``indoor``."""
 
 STRETCH = 20
 """Frames for which what is in range is picked out together."""
@@ -106,6 +107,11 @@ def _indoor(recipe: Recipe) -> tuple[Building, FloatArray, FloatArray]:
     return building, *random_walk(building, recipe.frames, rng, *pace)
 
 
+@lru_cache(maxsize=4)
+def _blind(recipe: Recipe) -> BlindDrive:
+    return blind_drive(kind_of(recipe.name), _even_stamps(recipe), recipe.tilt, recipe.generator(_PLAN))
+
+
 def _parked(recipe: Recipe) -> _Street:
     """Where a drive through the streets begins."""
     return _street(replace(recipe, world="street", frames=2))
@@ -120,6 +126,8 @@ def poses_of(recipe: Recipe) -> FloatArray:
         return _parked(recipe).poses[:1].repeat(recipe.frames, axis=0)
     if recipe.world in ("indoor", "standstill"):
         return planar_to_poses(_indoor(recipe)[1])
+    if recipe.world == "blind":
+        return _blind(recipe).poses
     return planar_to_poses(along(_even_stamps(recipe)))
 
 
@@ -166,6 +174,8 @@ def _scene(recipe: Recipe) -> Scene:
     if recipe.world in ("corridor", "few_returns"):
         build = bare_corridor if recipe.world == "corridor" else few_posts
         return Scene(build(float(along(stamps_of(recipe))[-1, 0]), standing), NO_WALLS, still)
+    if recipe.world == "blind":
+        return Scene(_blind(recipe).walls, NO_WALLS, still, _blind(recipe).ground)
     if recipe.world in ("indoor", "standstill"):
         building, planar, _ = _indoor(recipe)
         return populate(building, planar, standing, recipe.movers, recipe.scan_rate_hz)
