@@ -898,7 +898,7 @@ BLOCKED = ("torch", "lightning", "pytorch_lightning", "hydra", "omegaconf")
 FORBID = f"import sys; sys.modules.update(dict.fromkeys({BLOCKED!r}))"
 
 
-@pytest.mark.parametrize("words", [[], ["--model", "rcnn_small"]])
+@pytest.mark.parametrize("words", [[], ["--model", "rcnn_small"], ["--model", "fused"]])
 def test_the_command_needs_no_pytorch(tmp_path, words):
     make_kitti(tmp_path, ["05"], frames=4)
     command = ["run", str(tmp_path / "sequences" / "05"), *words, "--out", str(tmp_path / "out")]
@@ -914,10 +914,11 @@ from pathlib import Path
 
 import numpy as np
 
-from rcnn_odom.deployment import odometer, onnx_model, run, sampling, shipped
+from rcnn_odom.deployment import odometer, run, sampling, shipped
 from rcnn_odom.geometry import Step
 from rcnn_odom.models.contract import Description, Registered, find_model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream

@@ -10,12 +10,12 @@ import pytest
 from conftest import SHARED
 from rcnn_odom.cli import main
 from rcnn_odom.deployment.odometer import Odometer
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.deployment.shipped import FOLDER, find_file, shipped_models
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.drift import drift
 from rcnn_odom.geometry import change_frame
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.recordings import kitti, simulated
 
 REAL = SHARED / "data" / "kitti"

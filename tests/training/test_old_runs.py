@@ -17,10 +17,10 @@ from onnx import TensorProto, helper
 from conftest import LENGTHS
 from evaluate import evaluate
 from rcnn_odom.cli import main
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST, CONFIG
 from rcnn_odom.evaluation.sweep_report import load_runs
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 
 OLD = Path(__file__).parents[1] / "data" / "old_run"
 DRIFT = 0.198044

@@ -28,13 +28,13 @@ if TYPE_CHECKING:
     from rcnn_odom.models.contract import ScanTracker
     from rcnn_odom.recordings.stream import ScanStream
 
-MATCHER, OLD_NAME = "matcher", "icp"
+MATCHER, FUSED, OLD_NAME = "matcher", "fused", "icp"
 FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg", "base", "odom_topic")
 """Options that are a format's own."""
 FILE_OPTIONS = (*FORMAT_OPTIONS[1:], "wheels")
 """Those of recordings alone."""
-MATCHER_OPTIONS, NETWORK_OPTIONS = ("wheels", "odom_topic", "deskew"), ("threads",)
-"""Those that only scan matching has, and those that only a network has."""
+WHEEL_OPTIONS, MATCHER_OPTIONS, NETWORK_OPTIONS = ("wheels", "odom_topic"), ("deskew",), ("threads",)
+"""Those that only scan matching alone has, those that scan matching has, and those that a network has."""
 FIRST_SCANS = 100
 """In which the wheels must have been heard of."""
 
@@ -61,7 +61,12 @@ def add(commands: Subcommands) -> None:
         "--model",
         metavar="MODEL",
         help="matcher (scan matching, the default), an exported .onnx, a .ckpt, or rcnn_small, which ships "
-        "along",
+        "along; or fused: scan matching with a network's steps as its priors",
+    )
+    add(
+        "--network",
+        metavar="NETWORK",
+        help="of --model fused: an exported .onnx, a network that ships along (rcnn_small), or held",
     )
     add("--every", type=whole_number(1), metavar="N", help="take every N-th scan only")
     _add_poses_and_priors(parser)
@@ -109,7 +114,7 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
 
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     model = arguments.model or MATCHER
-    network = None if model == MATCHER else _load_network(model, arguments.threads or 1)
+    network = None if model in (MATCHER, FUSED) else _load_network(model, arguments.threads or 1)
     stream = _open(parser, arguments)
     odometer = Odometer(
         network or _build_matcher(arguments, stream), arguments.laser_pose or stream.laser_pose
@@ -142,10 +147,16 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         parser.error("--base and --laser-pose say the same; give one of them")
     if arguments.wheels and arguments.odom_topic:
         parser.error("--wheels and --odom-topic are two odometries; give one of them")
-    is_matcher = arguments.model in (None, MATCHER)
+    is_matcher, is_fused = arguments.model in (None, MATCHER), arguments.model == FUSED
     for names, is_refused, why in (
         (FILE_OPTIONS, arguments.live, "is of recordings, not of --live"),
-        (MATCHER_OPTIONS, not is_matcher, "is of the matcher, not of a network"),
+        (WHEEL_OPTIONS, is_fused, "is of the matcher alone, not of --model fused, whose prior is a network"),
+        (("network",), not is_fused, "is of --model fused"),
+        (
+            WHEEL_OPTIONS + MATCHER_OPTIONS,
+            not (is_matcher or is_fused),
+            "is of the matcher, not of a network",
+        ),
         (NETWORK_OPTIONS, is_matcher, "is of a network (--model), not of the matcher"),
     ):
         for name in names:
@@ -254,6 +265,10 @@ def _build_matcher(arguments: argparse.Namespace, stream: "ScanStream") -> "Scan
     from rcnn_odom.recordings.recording import wants_deskew
 
     deskew = wants_deskew(arguments.deskew or "auto", stream.is_compensated)
+    if arguments.model == FUSED:
+        from rcnn_odom.models.fused import FusedOptions, fused_tracker
+
+        return fused_tracker(arguments.network or FusedOptions.network, deskew, arguments.threads or 1)
     return MatcherTracker(wheels=bool(arguments.wheels or arguments.odom_topic), deskew=deskew)
 
 

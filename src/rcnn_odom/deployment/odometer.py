@@ -9,7 +9,6 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.deployment.shipped import find_file
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import (
@@ -21,6 +20,7 @@ from rcnn_odom.geometry import (
     planar_to_poses,
 )
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.models.streaming import ScanTracker
 from rcnn_odom.models.tracking import Kind, Tracking, no_step

@@ -138,7 +138,7 @@ class Registration:
             self._add(scan)
 
     def register(
-        self, scan: Outline, guess: FloatArray, spread: FloatArray, is_measured: bool = False
+        self, scan: Outline, guess: FloatArray, spread: FloatArray, pull: FloatArray | None = None
     ) -> Match:
         """The pose of one more scan.
 
@@ -146,12 +146,12 @@ class Registration:
             scan: its points and normals.
             guess: (3,) pose in the map's frame.
             spread: (3, 3) covariance of the guess in the map's frame.
-            is_measured: the guess is a measurement, that pulls by its covariance; otherwise it pulls weakly.
+            pull: (3, 3) covariance of what was measured of it, by which it pulls; None: it pulls weakly.
         """
-        if len(scan.points) < FEWEST_POINTS:
+        if len(scan.points) < FEWEST_POINTS or self.is_empty:
             return self._lose(scan, guess, spread)
         found, has_rival = self._search(
-            scan, guess, _stiffness(spread, len(scan.points)) if is_measured else WEAK_PRIOR
+            scan, guess, WEAK_PRIOR if pull is None else _stiffness(pull, len(scan.points))
         )
         if found.fit < LEAST_SCORE:
             return self._lose(scan, guess, spread)
@@ -220,11 +220,14 @@ class Registration:
         return starts + [(advance(ahead, np.array([shift, 0.0, 0.0])), gate) for shift in shifts]
 
     def _lose(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
-        """The guess, for a scan that does not fit the map; after several of them a new map begins there."""
+        """The guess, for a scan that does not fit the map; after several of them a new map begins there.
+
+        Where there is no map at all, one begins with the first scan that has enough to see.
+        """
         self._lost += 1
         covariances = self._uncertainty.update(self.pose, guess, spread, np.zeros((3, 3)))
         self.pose = guess
-        begins = self._lost > MOST_LOST and len(scan.points) >= FEWEST_POINTS
+        begins = (self._lost > MOST_LOST or self.is_empty) and len(scan.points) >= FEWEST_POINTS
         if begins:
             self.begin(scan)
         return Match(guess, *covariances, np.eye(3), fits=False, begins_map=begins)
@@ -270,9 +273,9 @@ def _is_rival(other: Aligned, best: Aligned) -> bool:
     return is_elsewhere and other.score > NEARLY * best.score
 
 
-def _stiffness(spread: FloatArray, points: int) -> FloatArray:
+def _stiffness(pull: FloatArray, points: int) -> FloatArray:
     """The pull (3, 3) of a measured guess, beside a mean square of 1 of a full scan's residuals' change."""
-    return WEAK_PRIOR + np.linalg.inv(spread) * POINT_ERROR**2 * CORRELATED / points
+    return WEAK_PRIOR + np.linalg.inv(pull) * POINT_ERROR**2 * CORRELATED / points
 
 
 def _wrap(angle: float) -> float:

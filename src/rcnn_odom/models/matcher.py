@@ -16,6 +16,7 @@ from rcnn_odom.matching.outline import Outline, outline
 from rcnn_odom.matching.points import find_points
 from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
 from rcnn_odom.models.contract import Model
+from rcnn_odom.models.prior import LastMotion, Prior, PriorSource, Wheels, believed
 from rcnn_odom.models.streaming import Registered
 from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.recordings.recording import Drive, wants_deskew
@@ -25,12 +26,8 @@ FARTHEST = 120.0
 """Metres from which on a reading is no return."""
 LONGEST_HOLD = 10.0
 """Periods over which the last motion goes on; for longer it is not known to."""
-GUESS_DISTANCE, GUESS_TURN = 0.1, 0.1
-"""Metres and radians a period by which the last motion is off as a guess, and beside them half of itself."""
-WHEELS_DISTANCE, WHEELS_TURN = 0.01, 0.01
-"""The same of wheel odometry."""
-SLIP = 0.1
-"""Part of a motion by which wheel odometry is off beside that."""
+GUESS_DISTANCE, GUESS_TURN, GUESS_PART = 0.1, 0.1, 0.5
+"""Metres and radians a period by which the last motion is off as a guess, beside a part of itself."""
 
 
 @dataclass(frozen=True)
@@ -66,6 +63,7 @@ def compile_matching() -> None:
 class MatcherTracker:
     """Registers each scan against a map of what the laser has seen lately.
 
+    Where the last motion goes on, another source of priors may have a better step, and the note says so.
     Notes are of these kinds:
 
     - *no returns*, or fewer than six points on anything (*few returns*): the last motion goes on.
@@ -79,12 +77,14 @@ class MatcherTracker:
     Args:
         wheels: as in :class:`MatcherOptions`.
         deskew: scans whose beams have times are undistorted by the current motion.
+        source: of what is known of a step before its scan is matched; None: the wheels or the last motion.
     """
 
     period = math.nan
 
-    def __init__(self, wheels: bool = False, deskew: bool = True) -> None:
+    def __init__(self, wheels: bool = False, deskew: bool = True, source: PriorSource | None = None) -> None:
         self.wheels, self.deskew = wheels, deskew
+        self._source = source or (Wheels() if wheels else LastMotion())
         compile_matching()
         self.reset()
 
@@ -94,13 +94,13 @@ class MatcherTracker:
         self._motion, self._seconds, self._held = np.zeros(3), math.nan, 0.0
         self._velocities: deque[FloatArray] = deque(maxlen=2)
         self._held_in_a_row, self._held_directions = 0, np.empty((3, 0))
-        self._wheel_pose: tuple[float, float, float] | None = None
+        self._source.reset()
         self._returns = np.empty((0, 2))
 
     @property
     def has_seen(self) -> bool:
-        """Whether there is a map that the next scan can be compared with."""
-        return not self._registration.is_empty
+        """Whether there is something that the next scan can be compared with."""
+        return not self._registration.is_empty or self._source.has_seen
 
     def returns(self) -> FloatArray:
         """Points (P, 2) in metres of the last scan in the laser's frame."""
@@ -112,21 +112,27 @@ class MatcherTracker:
         self._registration.begin(found)
         self._motion, self._held, self._held_in_a_row = np.zeros(3), 0.0, 0
         self._velocities.clear()
-        self._wheel_pose = scan.wheel_pose
-        return () if self.has_seen else (f"{_describe(found)}: none to compare with yet",)
+        notes = self._source.begin(scan)
+        return notes if self.has_seen else (f"{_describe(found)}: none to compare with yet", *notes)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
         """The step to one more scan."""
         passed = self._motions_passed(periods, seconds)
         scan_outline = self._find_outline(scan)
-        guess, spread, is_measured = self._guess(scan, passed)
+        prior, of_prior = self._source.expect(scan, periods, seconds, self._hold(passed))
         before = self._registration.pose
-        spread = self._in_map(spread, float(before[2]), is_measured)
-        match = self._registration.register(scan_outline, advance(before, guess), spread, is_measured)
+        turned = _turned(float(before[2]))
+        match = self._registration.register(
+            scan_outline,
+            advance(before, prior.step),
+            turned @ prior.covariance @ turned.T,
+            None if prior.pull is None else turned @ prior.pull @ turned.T,
+        )
         step = relative_step(before, match.pose)
+        self._source.compare(step, match.fits and not (match.held.shape[1] or match.is_ambiguous))
         x, y, heading = step.tolist()
-        self._wheel_pose = scan.wheel_pose
-        if match.fits:
+        is_estimated = match.fits or prior.comes_from_scan
+        if is_estimated:
             self._motion, self._held = step / periods, 0.0
             self._seconds = seconds / periods if seconds else math.nan
             if seconds:
@@ -136,53 +142,37 @@ class MatcherTracker:
             self._held += passed
         self._held_in_a_row = self._held_in_a_row + 1 if match.held.shape[1] else 0
         self._held_directions = match.held
-        notes = _describe_match(match, scan_outline)
-        return Registered(Step(x, y, heading, match.step, match.noise), notes, match.fits)
+        notes = (*_describe_match(match, scan_outline, prior.stands), *of_prior)
+        return Registered(Step(x, y, heading, match.step, match.noise), notes, is_estimated)
 
     def _motions_passed(self, periods: int, seconds: float | None) -> float:
         """How often the last motion fits into the time since the last scan."""
         return seconds / self._seconds if seconds and self._seconds > 0 else float(periods)
 
-    def _guess(self, scan: Scan, passed: float) -> tuple[FloatArray, FloatArray, bool]:
-        """The step (3,) that is expected, its covariance (3, 3), and whether it was measured.
-
-        Args:
-            scan: the next one.
-            passed: how often the last motion fits into the time since the last scan.
-        """
-        longer = 0.0
-        if self.wheels and scan.wheel_pose is not None and self._wheel_pose is not None:
-            guess = relative_step(np.array(self._wheel_pose), np.array(scan.wheel_pose))
-            least, part = (WHEELS_DISTANCE, WHEELS_TURN), SLIP
-            is_measured = True
-        else:
-            share = max(0.0, min(passed, LONGEST_HOLD - self._held))
-            guess, whole = (share % 1.0) * self._motion, int(share)
-            for _ in range(whole):
-                guess = advance(self._motion, guess)
-            least, part, is_measured = (GUESS_DISTANCE * passed, GUESS_TURN * passed), 0.5, False
-            longer = passed - share  # whether it goes on for longer than that is not known
-        x, y, heading = guess.tolist()
-        distance, turn = least[0] + part * math.hypot(x, y), least[1] + part * abs(heading)
-        if longer:
+    def _hold(self, passed: float) -> Prior:
+        """The last motion, for as often as it fits into the time since the last scan."""
+        share = max(0.0, min(passed, LONGEST_HOLD - self._held))
+        guess, whole = (share % 1.0) * self._motion, int(share)
+        for _ in range(whole):
+            guess = advance(self._motion, guess)
+        distance, turn = GUESS_DISTANCE * passed, GUESS_TURN * passed
+        if longer := passed - share:  # whether it goes on for longer than that is not known
             x, y, heading = self._motion.tolist()
             distance, turn = distance + longer * math.hypot(x, y), turn + longer * abs(heading)
-        return guess, np.diag([distance**2, distance**2, turn**2]), is_measured
+        return Prior(guess, self._grow(believed(guess, distance, turn, GUESS_PART)))
 
-    def _in_map(self, spread: FloatArray, heading: float, is_measured: bool) -> FloatArray:
-        """The covariance (3, 3) of a guess, of the laser's frame, in the map's.
+    def _grow(self, spread: FloatArray) -> FloatArray:
+        """The covariance (3, 3) of the last motion, after some steps along directions that were held.
 
-        Along what was held before, a motion that goes on errs alike every time: the error of n steps is n
-        times that of one, its variance n times n, to which the last step adds 2 n - 1.
+        A motion that goes on errs alike every time there: the error of n steps is n times that of one, its
+        variance n times n, to which the last step adds 2 n - 1.
         """
-        cos, sin = math.cos(heading), math.sin(heading)
-        turned = np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-        spread = turned @ spread @ turned.T
-        if self._held_in_a_row and not is_measured:
-            held = self._held_directions
-            along = np.einsum("ik,ij,jk->k", held, spread, held)
-            spread = spread + (2.0 * self._held_in_a_row) * (held * along) @ held.T
-        return spread
+        if not self._held_in_a_row:
+            return spread
+        turned = _turned(-float(self._registration.pose[2]))
+        held = turned @ self._held_directions
+        along = np.einsum("ik,ij,jk->k", held, spread, held)
+        return spread + (2.0 * self._held_in_a_row) * (held * along) @ held.T
 
     def _find_outline(self, scan: Scan) -> Outline:
         """Points and lines of a scan, undistorted if wanted."""
@@ -205,6 +195,12 @@ class MatcherTracker:
         return found
 
 
+def _turned(heading: float) -> FloatArray:
+    """The matrix (3, 3) that turns x and y by a heading in radians."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
 def _describe(scan: Outline) -> str:
     """What there is to see in a scan that cannot be registered."""
     if len(scan.returns) == 0:
@@ -212,8 +208,8 @@ def _describe(scan: Outline) -> str:
     return f"few returns: {len(scan.returns)}, {len(scan.points)} points of them of use"
 
 
-def _describe_match(match: Match, scan: Outline) -> tuple[str, ...]:
-    """Notes on a match, in words."""
+def _describe_match(match: Match, scan: Outline, stands: str) -> tuple[str, ...]:
+    """Notes on a match, and on what stands where there is none, in words."""
     if match.fits:
         notes = []
         if match.is_poor:
@@ -223,11 +219,11 @@ def _describe_match(match: Match, scan: Outline) -> tuple[str, ...]:
         if any(match.surprise):
             notes.append(_describe_surprise(*match.surprise))
         if match.held.shape[1]:
-            notes.append(f"held: nothing seen determines {_name_directions(match)}, the last motion goes on")
+            notes.append(f"held: nothing seen determines {_name_directions(match)}, {stands}")
         return tuple(notes)
     if len(scan.points) < FEWEST_POINTS:
-        return (f"{_describe(scan)}, the last motion goes on",)
-    lost = "no match: the scan does not fit what was seen before, the last motion goes on"
+        return (f"{_describe(scan)}, {stands}",)
+    lost = f"no match: the scan does not fit what was seen before, {stands}"
     return (lost, "new map: it begins here") if match.begins_map else (lost,)
 
 

@@ -17,13 +17,13 @@ from torch import Tensor, nn
 from tqdm import tqdm
 
 from rcnn_odom.deployment.odometer import Odometer
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.scores import aligned
 from rcnn_odom.geometry import Step
 from rcnn_odom.models.cnn import CNNRegression
 from rcnn_odom.models.contract import Description, Stepper, find_model
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.models.rcnn import RCNNRegression
 from rcnn_odom.models.trained import TrainedModel

@@ -1,26 +1,6 @@
 """Trained networks that ship with the project, each with its model card."""
 
-from pathlib import Path
-
-from rcnn_odom.errors import InputError
-
-FOLDER = Path(__file__).parent
-
-
-def shipped_models() -> list[str]:
-    """Names of the models."""
-    return sorted(path.stem for path in FOLDER.glob("*.onnx"))
-
-
-def find_file(path: str | Path) -> Path:
-    """A file by its path, or a model that ships with the project by its name.
-
-    Raises:
-        InputError: neither is there.
-    """
-    if Path(path).is_file():
-        return Path(path)
-    names = shipped_models()
-    if str(path) in names:
-        return FOLDER / f"{path}.onnx"
-    raise InputError(f"{path}: no such file, nor a model that ships with rcnn-odom ({', '.join(names)})")
+# Models find them as well, and models know nothing of deployment.
+from rcnn_odom.models.shipped_files import FOLDER as FOLDER
+from rcnn_odom.models.shipped_files import find_file as find_file
+from rcnn_odom.models.shipped_files import shipped_models as shipped_models

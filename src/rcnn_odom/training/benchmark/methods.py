@@ -4,11 +4,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.deployment.shipped import find_file, shipped_models
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST
 from rcnn_odom.models.contract import Model, ScanTracker, Stepper, find_model
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.options import check_options
 from rcnn_odom.training.benchmark.sets import LoadedSet

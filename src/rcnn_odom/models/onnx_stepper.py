@@ -9,8 +9,8 @@ import numpy.typing as npt
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import Step
-from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.streaming import Description, Warping
 
 METADATA = "rcnn_odom"
 """Key of the file's metadata that holds all that an odometer has to know, as JSON."""
@@ -48,7 +48,7 @@ class OnnxStepper:
             ) from error
         if not current:
             raise InputError(f"{path}: written by an older version; export the checkpoint again")
-        if bins != self.description.sensor.bins:
+        if bins != self.description.input_sensor.bins:
             raise InputError(f"{path}: its network and its metadata differ in the sensor; export it again")
         self._outputs = ["step", "covariance", *(f"{name}_out" for name in inputs)]
         self._initial = {name: np.zeros(shape, np.float32) for name, shape in inputs.items()}
@@ -96,4 +96,5 @@ def _describe(metadata: dict[str, Any]) -> Description:
     """What the metadata say of the network; null is nan."""
     values = [*metadata["typical_step"], metadata["least_filled"], metadata["period"]]
     x, y, heading, filled, period = (np.nan if value is None else float(value) for value in values)
-    return Description(Sensor(**metadata["sensor"]), (x, y, heading), filled, period)
+    warping = Warping(**metadata["warping"]) if metadata.get("warping") else None
+    return Description(Sensor(**metadata["sensor"]), (x, y, heading), filled, period, warping)
