@@ -1,6 +1,7 @@
 """Windows, their sampler, the parts of recordings, and augmentation against a room that is drawn exactly."""
 
 from dataclasses import replace
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.parts import cut, parse_part
 from rcnn_odom.recordings.recording import Drive, Recording
 from rcnn_odom.recordings.scan import Scan
+from rcnn_odom.training.augmentation import Augmentation
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.windows import Windows, WindowSampler, turn_scan
 
@@ -81,13 +83,13 @@ def test_window_holds_consecutive_pairs_and_their_steps():
 def test_augmentation_leaves_the_recording_alone():
     drive = encoded(random_planar(5))
     scans, steps = drive.scans.copy(), drive.steps.copy()
-    Windows([drive], FULL, 3, max_turn_bins=20).__getitems__([(0, 1, True), (1, 2, False)])
+    Windows([drive], FULL, 3, Augmentation(FULL, max_turn_deg=20)).__getitems__([(0, 1, True), (1, 2, False)])
     np.testing.assert_array_equal(drive.scans, scans)
     np.testing.assert_array_equal(drive.steps, steps)
 
 
-def drawn(lengths, window, seed=0, epoch=0, mirror=False):
-    sampler = WindowSampler(lengths, window, mirror, seed)
+def drawn(lengths, window, seed=0, epoch=0, mirror=False, stride=None):
+    sampler = WindowSampler(lengths, window, mirror, seed, stride)
     sampler.set_epoch(epoch)
     draws = list(sampler)
     assert len(draws) == len(sampler)
@@ -115,6 +117,27 @@ def test_every_pair_is_trained_on_in_some_epoch(window, frames):
         for frame, _, _ in drawn([frames], window, epoch=epoch):
             seen |= set(range(frame, frame + window))
     assert seen == set(range(frames - 1))
+
+
+@pytest.mark.parametrize(("window", "stride"), [(16, 4), (5, 1), (3, 7), (1, 3), (16, 40)])
+def test_windows_begin_a_stride_apart(window, stride):
+    lengths = [17, 40, 33]
+    borders, seen = np.cumsum([0, *lengths]), set()
+    for epoch in range(400):
+        frames = np.array(sorted(frame for frame, _, _ in drawn(lengths, window, 0, epoch, stride=stride)))
+        drive = np.searchsorted(borders, frames, side="right") - 1
+        assert set(drive) == {0, 1, 2}
+        assert (frames + window < borders[drive + 1]).all()
+        assert (np.diff(frames)[np.diff(drive) == 0] == stride).all()
+        seen |= {int(frame) + pair for frame in frames for pair in range(window)}
+    assert seen == {frame for low, high in pairwise(borders) for frame in range(low, high - 1)}
+
+
+def test_a_stride_of_the_window_is_the_default():
+    for window in (1, 2, 16):
+        assert drawn([40, 33], window, 3, 2) == drawn([40, 33], window, 3, 2, stride=window)
+    # 160 frames: 9 windows of 16 pairs as ever, 36 where each begins 4 frames after the one before.
+    assert [len(drawn([160], 16, stride=stride)) for stride in (None, 4, 1)] == [9, 36, 144]
 
 
 def test_single_pairs_are_all_drawn_in_every_epoch():
@@ -168,7 +191,7 @@ def test_turned_half_circle_is_empty_where_nothing_was_seen(bins):
 def test_turned_window_has_exact_labels():
     planar = random_planar(9)
     drive = encoded(planar)
-    batch = Windows([drive], FULL, 8, max_turn_bins=25).__getitems__([(0, 5, False)])
+    batch = Windows([drive], FULL, 8, Augmentation(FULL, max_turn_deg=25)).__getitems__([(0, 5, False)])
     pairs, steps = batch["pairs"][0].numpy(), batch["steps"][0].numpy().astype(np.float64)
     for number, (pair, step) in enumerate(zip(pairs, steps, strict=True)):
         np.testing.assert_allclose(pair[0], look(planar[number], FULL), rtol=1e-5)
@@ -197,7 +220,8 @@ def test_mirrored_window_is_a_drive_through_the_mirrored_room(sensor):
 
 def test_turned_and_mirrored_window_has_exact_labels():
     planar = random_planar(4)
-    batch = Windows([encoded(planar)], FULL, 3, max_turn_bins=25).__getitems__([(0, 5, True)])
+    windows = Windows([encoded(planar)], FULL, 3, Augmentation(FULL, max_turn_deg=25))
+    batch = windows.__getitems__([(0, 5, True)])
     mirrored = planar * [1, -1, -1]
     for number in range(3):
         step = batch["steps"][0, number].numpy().astype(np.float64)
@@ -406,7 +430,7 @@ def test_a_laser_that_faces_aside_has_no_mirror_image(cache):
     ):
         OdometryDataModule(open_room, [], [], [], aside, cache, mirror=True)
     behind = Sensor(1.0, 180.0, 40.0, facing_deg=180.0)
-    assert OdometryDataModule(open_room, [], [], [], behind, cache, mirror=True).mirror
+    assert OdometryDataModule(open_room, [], [], [], behind, cache, mirror=True).augmentation.mirror
 
 
 def test_validation_and_test_are_whole_drives_in_order(cache):
@@ -426,10 +450,15 @@ def test_training_batches_have_the_asked_shape(cache):
     assert len(list(room_module(cache, batch_size=1000).load().train_dataloader())) == 1
 
 
+def test_stride_makes_more_batches_of_overlapping_windows(cache):
+    module = room_module(cache, window=4, batch_size=3, stride=1).load()
+    assert module.batches_per_epoch == len(module.train_dataloader()) == (40 - 4) // 3
+
+
 def test_turn_is_asked_for_in_degrees(cache):
     sensor = Sensor(0.5, 360.0, 40.0)
     module = OdometryDataModule(open_room, [], [], [], sensor, cache, max_turn_deg=3.0)
-    assert module.max_turn_bins == 6
+    assert module.augmentation.max_turn_bins == 6
 
 
 def test_training_steps_are_those_of_the_training_drives(cache):

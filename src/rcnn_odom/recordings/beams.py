@@ -116,23 +116,31 @@ def find_beams(bearings: FloatArray) -> Beams:
     return Beams(first, 360.0 - float(gaps[widest]), spacing)
 
 
-def compare_beams(beams: Beams, sensor: Sensor) -> str:
-    """Why these beams are not the sensor's; empty where they fit."""
+def compare_beams(beams: Beams, sensor: Sensor, partly: bool = False) -> str:
+    """Why these beams are not the sensor's; empty where they fit.
+
+    Args:
+        beams: of a laser.
+        sensor: what it should be like.
+        partly: they may cover only a part of its field of view, and be farther apart than its bins.
+    """
     covered, width = beams.covered, sensor.field_of_view_deg
     # Rounding, and a laser that leaves its last beam out, are no other laser.
     slack = beams.spacing + sensor.resolution_deg
-    fits = covered >= LEAST_COVERED * width - slack
+    fits = partly or covered >= LEAST_COVERED * width - slack
     if width < 360:
         aside = abs(_wrap(beams.middle - sensor.facing_deg))
         fits = fits and aside + covered / 2 <= width / 2 + slack
-    if fits and CLOSEST * sensor.resolution_deg < beams.spacing < FARTHEST * sensor.resolution_deg:
+    farthest = FARTHEST * (RESOLUTIONS_DEG[-1] if partly else sensor.resolution_deg)
+    if fits and CLOSEST * sensor.resolution_deg < beams.spacing < farthest:
         return ""
     if width == 360:
         wanted = "all round"
     else:
         low = sensor.facing_deg - width / 2
         wanted = f"from {low:.4g} to {low + width:.4g} degrees"
-    return f"its beams lie {beams}, the sensor's {wanted}, one every {sensor.resolution_deg:g}"
+    words = "no part of the sensor's" if partly else "the sensor's"
+    return f"its beams lie {beams}, {words} {wanted}, one every {sensor.resolution_deg:g}"
 
 
 def compare_ranges(ranges: FloatArray) -> str:
@@ -150,6 +158,7 @@ class BeamCheck:
 
     Args:
         sensor: what the scans are encoded for.
+        partly: their beams may be a part of the sensor's; see :func:`compare_beams`.
 
     Attributes:
         fitting, misfitting: scans that did fit, and that did not.
@@ -158,8 +167,8 @@ class BeamCheck:
         beams: of the last scan that told of them.
     """
 
-    def __init__(self, sensor: Sensor) -> None:
-        self.sensor = sensor
+    def __init__(self, sensor: Sensor, partly: bool = False) -> None:
+        self.sensor, self.partly = sensor, partly
         self.fitting, self.misfitting, self.in_a_row, self.reason = 0, 0, 0, ""
         self.beams: Beams | None = None
         self._seen: object = None
@@ -222,4 +231,4 @@ class BeamCheck:
             except ValueError as error:
                 self.beams = None
                 return str(error)
-        return compare_beams(self.beams, self.sensor)
+        return compare_beams(self.beams, self.sensor, self.partly)

@@ -72,7 +72,7 @@ class Encoding:
             # One is enough: a worker's pieces of a drive follow each other.
             self._opened = {name: self.open_recording(name)}
         recording = self._opened[name]
-        check = beams.BeamCheck(self.encoder)
+        check = beams.BeamCheck(self.encoder, recording.has_partial_laser)
         depths = np.zeros((stop - start, self.encoder.bins), np.float32)
         for depth, frame in zip(depths, range(start, stop), strict=True):
             scan = recording.read_scan(frame)

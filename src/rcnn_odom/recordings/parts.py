@@ -6,6 +6,7 @@
 import logging
 import re
 from collections.abc import Mapping
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -93,3 +94,35 @@ def cut(drives: Mapping[str, Drive], name: str) -> Drive:
     if len(known) != len(part):
         log.info("%s: frames %d to %d of %d, where the truth is known", name, first, last, len(part))
     return part.part(first, last + 1)
+
+
+def trusted_pieces(drive: Drive, least: int) -> list[Drive]:
+    """The pieces of a drive in which every true step is good enough to learn from; without doubt the drive.
+
+    Args:
+        drive: to train on.
+        least: frames that a piece must have.
+
+    Raises:
+        InputError: there is no such piece.
+    """
+    doubted = [] if drive.trusted is None else (np.flatnonzero(~drive.trusted[1:]) + 1).tolist()
+    if not doubted:
+        return [drive]
+    frames = drive.frames or range(len(drive))
+    pieces = [
+        drive.part(start, stop, f"{drive.name}:{frames[start]}-{frames[stop - 1]}")
+        for start, stop in pairwise([0, *doubted, len(drive)])
+        if stop - start >= least
+    ]
+    if not pieces:
+        raise InputError(
+            f"training sequence {drive.name}: nowhere are {least} scans in a row without a step whose truth "
+            "is doubtful; leave it out of data.train, or set model.window lower"
+        )
+    log.info(
+        "%s: %d of %d scans to train on, in %d pieces",
+        drive.name,
+        *(sum(map(len, pieces)), len(drive), len(pieces)),
+    )
+    return pieces

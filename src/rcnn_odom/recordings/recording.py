@@ -41,6 +41,10 @@ class Recording:
         notes: what the reader noticed, counted or flagged, in words for the user.
         has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
         is_compensated: the motion of the laser during a revolution has been taken out of its points already.
+        keeps_world: there is no other drive of its kind, so that a training on new worlds keeps it.
+        has_partial_laser: as the user says, the laser may see a part of what the sensor covers, with beams
+            farther apart than the sensor's bins.
+        trusted: (N,) whether the true step to a scan is good enough to learn from; None: all are.
     """
 
     name: str
@@ -53,6 +57,9 @@ class Recording:
     notes: tuple[str, ...] = ()
     has_clock: bool = True
     is_compensated: bool = False
+    keeps_world: bool = False
+    has_partial_laser: bool = False
+    trusted: npt.NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
         return len(self.poses)
@@ -73,7 +80,8 @@ class Drive:
             look at them.
         poses: (N, 4, 4) true laser poses.
         stamps: (N,) seconds.
-        camera_from_laser, wheel_odometry, has_clock, is_compensated: as in :class:`Recording`.
+        camera_from_laser, wheel_odometry, has_clock, is_compensated, trusted, keeps_world: as in
+            :class:`Recording`.
         read_scan: of the recording.
         frames: the recording's frame of each scan; None: all of them.
     """
@@ -87,8 +95,10 @@ class Drive:
     wheel_odometry: FloatArray | None = None
     has_clock: bool = True
     is_compensated: bool = False
+    trusted: npt.NDArray[np.bool_] | None = None
     read_scan: ReadScan | None = None
     frames: range | None = None
+    keeps_world: bool = False
 
     @classmethod
     def of(cls, recording: Recording, scans: npt.NDArray[np.float32], key: str) -> "Drive":
@@ -103,7 +113,9 @@ class Drive:
             wheel_odometry=recording.wheel_odometry,
             has_clock=recording.has_clock,
             is_compensated=recording.is_compensated,
+            trusted=recording.trusted,
             read_scan=recording.read_scan,
+            keeps_world=recording.keeps_world,
         )
 
     @classmethod
@@ -146,6 +158,7 @@ class Drive:
             poses=self.poses[start:stop],
             stamps=self.stamps[start:stop],
             wheel_odometry=None if wheel is None else wheel[start:stop],
+            trusted=None if self.trusted is None else self.trusted[start:stop],
             frames=(self.frames or range(len(self)))[start:stop],
         )
 
@@ -158,5 +171,13 @@ class Drive:
             poses=self.poses[::every],
             stamps=self.stamps[::every],
             wheel_odometry=None if wheel is None else wheel[::every],
+            trusted=None if self.trusted is None else _trust_all(self.trusted, every),
             frames=(self.frames or range(len(self)))[::every],
         )
+
+
+def _trust_all(trusted: npt.NDArray[np.bool_], every: int) -> npt.NDArray[np.bool_]:
+    """Whether all steps (N,) to a scan since the last one that stays are trusted, of the scans that stay."""
+    steps = np.concatenate([np.ones(every - 1, dtype=np.bool_), trusted])
+    steps = steps[: (len(steps) // every) * every].reshape(-1, every)
+    return np.logical_and.reduce(steps, axis=1)  # type: ignore[no-any-return]

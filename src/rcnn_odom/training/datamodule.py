@@ -14,9 +14,10 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.cache import encode_recordings
-from rcnn_odom.recordings.parts import cut, parse_part
+from rcnn_odom.recordings.parts import cut, parse_part, trusted_pieces
 from rcnn_odom.recordings.recording import Drive, OpenRecording, Recording
 from rcnn_odom.recordings.returns import AbsentReturns
+from rcnn_odom.training.augmentation import Augmentation
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 from rcnn_odom.training.windows import Batches, FreshSampler, TrainingLoader, Windows, WindowSampler
 
@@ -49,13 +50,15 @@ class OdometryDataModule(L.LightningDataModule):
             ``NAME[::3]`` every third scan.
         sensor: what the depth vectors are like.
         window: pairs in a training window; 1 for the CNNs. batch_size: windows in a batch.
-        max_turn_deg, mirror: label-exact augmentation of the training windows; 0 and False: none.
+        stride: frames between the beginnings of windows; None: the window's length.
+        repeat: how often each window comes in an epoch.
         cache_dir: where encoded scans are kept. workers: processes that encode; None for all cores.
         seed: of the order and the augmentation.
         fresh_epochs: of a training on new worlds in every epoch, where ``open_recording`` makes a drive for
             any name: see :class:`rcnn_odom.training.fresh_worlds.FreshWorlds`. 0: every epoch sees the same
             drives.
         worlds_dir: of those worlds, removed after use; None: they stay in ``cache_dir``, for other trainings.
+        augment: options of :class:`rcnn_odom.training.augmentation.Augmentation`, of the training windows.
 
     Attributes:
         fresh_first: where the numbers of the new worlds begin: after those of the stage before.
@@ -71,23 +74,20 @@ class OdometryDataModule(L.LightningDataModule):
         cache_dir: str | Path,
         window: int = 1,
         batch_size: int = 64,
-        max_turn_deg: float = 0.0,
-        mirror: bool = False,
+        stride: int | None = None,
+        repeat: int = 1,
         workers: int | None = None,
         seed: int = 0,
         fresh_epochs: int = 0,
         worlds_dir: str | Path | None = None,
+        **augment: Any,
     ) -> None:
         super().__init__()
         self.open_recording, self.sensor, self.cache_dir = open_recording, sensor, Path(cache_dir)
         self.names = {"train": train, "val": val, "test": test}
         self.window, self.batch_size, self.seed = window, batch_size, seed
-        self.max_turn_bins, self.mirror = round(max_turn_deg / sensor.resolution_deg), mirror
-        if mirror and sensor.facing_deg % 180:
-            raise InputError(
-                f"data.augment.mirror=true: the mirror image of a laser that faces {sensor.facing_deg:g} "
-                "degrees is another laser; leave it out"
-            )
+        self.stride, self.repeat = stride, repeat
+        self.augmentation = Augmentation(sensor, **augment)
         self.workers = workers or os.cpu_count() or 1
         self.drives: dict[str, list[Drive]] = {}
         self.fresh_epochs, self.fresh_first = fresh_epochs, 0
@@ -110,10 +110,14 @@ class OdometryDataModule(L.LightningDataModule):
                 without a return or shorter than a window; new worlds are wanted in place of a part of a
                 drive.
         """
-        self._check_names(splits)
+        for split in splits:
+            if not self.names[split]:
+                raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
         wanted = [parse_part(name) for split in splits for name in self.names[split]]
         files = list(dict.fromkeys(part.file for part in wanted))
         recordings = [self.open_recording(file) for file in files]
+        if "train" in splits:
+            self._check_parts(dict(zip(files, recordings, strict=True)))
         for recording in recordings:
             for note in recording.notes:
                 log.info("%s: %s", recording.name, note)
@@ -121,6 +125,10 @@ class OdometryDataModule(L.LightningDataModule):
         whole = dict(zip(files, drives, strict=True))
         for split in splits:
             self.drives[split] = [cut(whole, name) for name in self.names[split]]
+        if "train" in splits:
+            least = self.window + 1
+            drives = [piece for drive in self.drives["train"] for piece in trusted_pieces(drive, least)]
+            self.drives["train"] = drives
         self._check_windows()
         return self
 
@@ -131,13 +139,11 @@ class OdometryDataModule(L.LightningDataModule):
             self._check_returns(recording, drive)
         return drives
 
-    def _check_names(self, splits: tuple[str, ...]) -> None:
-        for split in splits:
-            if not self.names[split]:
-                raise InputError(f"data.{split} names no sequence; give one, data.{split}=[NAME]")
-        for name in self.names["train"] if "train" in splits else []:
+    def _check_parts(self, recordings: dict[str, Recording]) -> None:
+        """Refuses parts of training drives that are made anew in every epoch."""
+        for name in self.names["train"] if self.fresh_epochs else []:
             whole = parse_part(name).file
-            if self.fresh_epochs and whole != name:
+            if whole != name and not recordings[whole].keeps_world:
                 raise InputError(
                     f"data.train={name}: new worlds come as whole drives; set data.fresh_worlds=false, "
                     f"or name {whole}"
@@ -180,7 +186,7 @@ class OdometryDataModule(L.LightningDataModule):
     def train_dataloader(self) -> DataLoader:
         """Shuffled batches of windows: see :class:`rcnn_odom.training.windows.Windows`."""
         drives = self.drives["train"]
-        self.windows = Windows(drives, self.sensor, self.window, self.max_turn_bins)
+        self.windows = Windows(drives, self.sensor, self.window, self.augmentation)
         sampler, (rank, processes) = self._sampler(), self._place()
         if self.fresh_epochs:
             self.close()
@@ -194,7 +200,7 @@ class OdometryDataModule(L.LightningDataModule):
                 keep=self.worlds_dir is None,
                 first=self.fresh_first,
             )
-            sampler = FreshSampler(self.windows, self.worlds, self.mirror, self.seed)
+            sampler = FreshSampler(self.windows, self.worlds, *self._sampling())
         # A batch is gathered in one call, so there is nothing to collate; worker processes would only
         # copy what a memory map gives for nothing.
         return TrainingLoader(
@@ -205,7 +211,10 @@ class OdometryDataModule(L.LightningDataModule):
 
     def _sampler(self) -> WindowSampler:
         lengths = [len(drive) for drive in self.drives["train"]]
-        return WindowSampler(lengths, self.window, self.mirror, self.seed)
+        return WindowSampler(lengths, self.window, *self._sampling())
+
+    def _sampling(self) -> tuple[bool, int, int | None, int]:
+        return self.augmentation.mirror, self.seed, self.stride, self.repeat
 
     @property
     def batches_per_epoch(self) -> int:

@@ -25,10 +25,11 @@ class FreshWorlds:
 
     Epoch 0 of a stage's training has the training set itself, epoch e a drive ``NAME~(first + e)`` in
     place of each NAME, as long as it and whatever the number of workers or the epoch at which a stopped
-    run goes on. They are maps of files, so memory does not grow with them.
+    run goes on. They are maps of files, so memory does not grow with them. Drives that keep their world,
+    such as logs of a robot, are the same in every epoch.
 
     Args:
-        open_recording: picklable; a generator that takes any name.
+        open_recording: picklable; a generator that takes any name but those of drives that keep their world.
         drives: the training set.
         epochs: of this stage's training.
         sensor: theirs.
@@ -52,7 +53,8 @@ class FreshWorlds:
         self.open_recording, self.drives, self.epochs = open_recording, drives, epochs
         self.sensor, self.first = sensor, first
         self.folder, self.keep = folder, keep
-        self.worker_count = useful_workers(workers, sum(map(len, drives)))
+        self.renewed = [drive for drive in drives if not drive.keeps_world]
+        self.worker_count = useful_workers(workers, sum(map(len, self.renewed)))
         self.waited = 0.0
         """Seconds for which training stood still for the worlds of the present epoch."""
         self._workers: Workers[Encoded] | None = None
@@ -77,12 +79,12 @@ class FreshWorlds:
             if e not in self._made:
                 self._made[e] = self._maker.submit(self._make, e)
         start = time.monotonic()
-        drives = self._made[epoch].result() if epoch in self._made else self.drives
+        made = iter(self._made[epoch].result() if epoch in self._made else self.renewed)
         self.waited = time.monotonic() - start
-        return drives
+        return [drive if drive.keeps_world else next(made) for drive in self.drives]
 
     def _worlds(self, epoch: int) -> list[Recording]:
-        return [self.open_recording(f"{drive.name}~{self.first + epoch}") for drive in self.drives]
+        return [self.open_recording(f"{drive.name}~{self.first + epoch}") for drive in self.renewed]
 
     def _are_made(self, worlds: list[Recording]) -> bool:
         return all(cache_path(world, self.sensor, self.folder).exists() for world in worlds)

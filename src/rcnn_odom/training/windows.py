@@ -1,4 +1,4 @@
-"""Training windows: consecutive pairs of scans, in which order they are drawn, and their augmentation."""
+"""Training windows: consecutive pairs of scans, and in which order they are drawn."""
 
 import math
 from collections.abc import Iterator
@@ -13,10 +13,11 @@ from torch.utils.data import BatchSampler, DataLoader, Dataset, Sampler
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.trained import Batch
 from rcnn_odom.recordings.recording import Drive
+from rcnn_odom.training.augmentation import Augmentation
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 
 Draw = tuple[int, int, bool]
-"""What the sampler decides about one window: its first frame, a seed for the turns, mirrored or not."""
+"""What the sampler decides about a window: its first frame, a seed for its augmentation, mirrored or not."""
 
 
 class Windows(Dataset):
@@ -26,13 +27,14 @@ class Windows(Dataset):
         drives: to draw from.
         sensor: theirs.
         length: pairs in a window; 1 gives the CNNs their single pairs.
-        max_turn_bins: the second scan of each pair is turned by up to so many whole bins, and the true
-            heading change with it; both stay exact. 0: never.
+        augmentation: what happens to them; None: nothing.
     """
 
-    def __init__(self, drives: list[Drive], sensor: Sensor, length: int, max_turn_bins: int = 0) -> None:
+    def __init__(
+        self, drives: list[Drive], sensor: Sensor, length: int, augmentation: Augmentation | None = None
+    ) -> None:
         self.drives, self.sensor, self.length = drives, sensor, length
-        self.max_turn_bins = max_turn_bins
+        self.augmentation = augmentation or Augmentation(sensor)
         self.first_frames = np.cumsum([0] + [len(drive) for drive in drives])
 
     def __getitems__(self, draws: list[Draw]) -> Batch:
@@ -75,13 +77,14 @@ class Windows(Dataset):
     ) -> None:
         """Fills in pairs (T, 2, bins) and steps (T, 3) of one window."""
         drive, start = self._locate(frame)
-        stop = start + self.length
-        pairs[:, 0], pairs[:, 1] = drive.scans[start:stop], drive.scans[start + 1 : stop + 1]
-        steps[:] = drive.steps[start:stop]
-        if self.max_turn_bins:
-            turns = np.random.default_rng(seed).integers(
-                -self.max_turn_bins, self.max_turn_bins, self.length, endpoint=True
-            )
+        stop, augmentation = start + self.length, self.augmentation
+        scans, truth = drive.scans[start : stop + 1], drive.steps[start:stop]
+        if augmentation.is_of_scans:
+            scans, truth = augmentation.change(scans, truth, seed)
+        pairs[:, 0], pairs[:, 1] = scans[:-1], scans[1:]
+        steps[:] = truth
+        if most := augmentation.max_turn_bins:
+            turns = np.random.default_rng(seed).integers(-most, most, self.length, endpoint=True)
             for pair, turn in zip(pairs, turns, strict=True):
                 pair[1] = turn_scan(pair[1], int(turn), self.sensor)
             # A turn on the spot after the step: where the laser is stays as it was.
@@ -112,12 +115,24 @@ class WindowSampler(Sampler[Draw]):
 
     Args:
         lengths: frames of each drive. window: pairs in a window. mirror: mirror every other window.
+        stride: frames between the beginnings of windows; None: the window's length, so that none overlap.
+        repeat: how often each window comes in an epoch, each time augmented in another way.
     """
 
-    def __init__(self, lengths: list[int], window: int, mirror: bool, seed: int) -> None:
+    def __init__(
+        self,
+        lengths: list[int],
+        window: int,
+        mirror: bool,
+        seed: int,
+        stride: int | None = None,
+        repeat: int = 1,
+    ) -> None:
         self.lengths, self.window, self.mirror, self.seed = lengths, window, mirror, seed
-        # One window fewer than would fit leaves the room by which the first frame moves.
-        self.counts = [max(1, length // window - 1) if window > 1 else length - 1 for length in lengths]
+        self.stride, self.repeat = stride or window, repeat
+        # Of the frames at which a window can begin, each stride has one; what is left over is the room by
+        # which the first window moves, so that every pair has its turn.
+        self.counts = [max(1, (length - window) // self.stride) for length in lengths]
         self.epoch = 0
 
     def set_epoch(self, epoch: int) -> None:
@@ -125,17 +140,17 @@ class WindowSampler(Sampler[Draw]):
         self.epoch = epoch
 
     def __len__(self) -> int:
-        return sum(self.counts)
+        return sum(self.counts) * self.repeat
 
     def __iter__(self) -> Iterator[Draw]:
         rng = np.random.default_rng([self.seed, self.epoch])
         frames, first = [], 0
         for length, count in zip(self.lengths, self.counts, strict=True):
-            room = length - 1 - count * self.window
+            room = length - 1 - self.window - (count - 1) * self.stride
             offset = int(rng.integers(room + 1))
-            frames += [first + offset + window * self.window for window in range(count)]
+            frames += [first + offset + window * self.stride for window in range(count)]
             first += length
-        for frame in rng.permutation(frames):
+        for frame in rng.permutation(frames * self.repeat):
             yield int(frame), int(rng.integers(2**32)), self.mirror and bool(rng.integers(2))
 
 
@@ -144,11 +159,20 @@ class FreshSampler(WindowSampler):
 
     Args:
         windows: of the first epoch's drives. worlds: the drives of every epoch.
-        mirror, seed: as for :class:`WindowSampler`.
+        mirror, seed, stride, repeat: as for :class:`WindowSampler`.
     """
 
-    def __init__(self, windows: Windows, worlds: FreshWorlds, mirror: bool, seed: int) -> None:
-        super().__init__([len(drive) for drive in worlds.drives], windows.length, mirror, seed)
+    def __init__(
+        self,
+        windows: Windows,
+        worlds: FreshWorlds,
+        mirror: bool,
+        seed: int,
+        stride: int | None = None,
+        repeat: int = 1,
+    ) -> None:
+        lengths = [len(drive) for drive in worlds.drives]
+        super().__init__(lengths, windows.length, mirror, seed, stride, repeat)
         self.windows, self.worlds = windows, worlds
 
     def set_epoch(self, epoch: int) -> None:
