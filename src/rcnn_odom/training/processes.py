@@ -1,4 +1,4 @@
-"""Training in several processes that Lightning starts: their errors and signals, as if there were one."""
+"""Training in several processes: their errors and signals, as if there were one."""
 
 import logging
 import multiprocessing
@@ -10,6 +10,7 @@ import lightning as L
 from torch.multiprocessing import ProcessExitedException, ProcessRaisedException
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.training import cluster
 from rcnn_odom.training.saving import SIGNALS, Stopped, TimeUp
 
 # It warns of every process that it ends because another one has failed.
@@ -37,6 +38,8 @@ def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
                 "a training process was killed, perhaps for want of memory; the same command goes on from "
                 "the last checkpoint"
             ) from error
+        except RuntimeError as error:
+            raise cluster.lost(error) from error
 
 
 def _translate(error: ProcessRaisedException, *, asked: bool) -> Exception:
@@ -62,7 +65,7 @@ def _signals_passed_on(trainer: L.Trainer) -> Iterator[list[int]]:
         The signals that have come.
     """
     asked: list[int] = []
-    if trainer.world_size == 1:
+    if trainer.world_size == 1 or cluster.has_joined():
         yield asked
         return
 

@@ -7,6 +7,7 @@ from typing import Any
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import Settings
 from rcnn_odom.options import option
+from rcnn_odom.training.cluster import World, find_world
 
 _VALIDATION = (
     "validation runs over whole drives after every epoch, since the best checkpoint is chosen by it; "
@@ -28,7 +29,6 @@ INSTEAD = {
     "overfit_batches": "choose what is learned and validated on; set data.train=[...] data.val=[...]",
     **dict.fromkeys(("max_epochs", "min_epochs", "max_steps", "min_steps"), _EPOCHS),
     "accumulate_grad_batches": "a step is one batch, which the recipe counts by; set model.batch_size",
-    "num_nodes": "a run is trained on one machine; set trainer=ddp trainer.devices=...",
     "default_root_dir": _FOLDER,
     **dict.fromkeys(("logger", "log_every_n_steps", "enable_autolog_hparams", "model_registry"), _LOG),
     "enable_checkpointing": _CHECKPOINTS,
@@ -87,6 +87,7 @@ class TrainerOptions:
     gradient_clip_val: float | None = option(above=0, wanted="null, which clips nothing, or a number above 0")
     gradient_clip_algorithm: str = option(default="norm", choices=("norm",))
     strategy: str = option(default="auto", choices=("auto", "ddp_spawn"))
+    num_nodes: int | None = option(default=None, above=0)
     deterministic: bool | str | None = option(default=None, choices=("warn",), wanted="true, false or warn")
     benchmark: bool | None = option(default=None)
     detect_anomaly: bool = option(default=False)
@@ -141,6 +142,56 @@ def shorten_if_wanted(settings: Settings) -> None:
         model["epochs"] = 1
         if isinstance(first_stage := model.get("first_stage"), dict):
             first_stage["epochs"] = 1
+
+
+def processes_per_node(default: int) -> int:
+    """How many processes torchrun or Slurm has started on each node; the default where they have not."""
+    try:
+        world = find_world()
+    except InputError:  # will be told when the command begins
+        return default
+    return world.per_node if world else default
+
+
+def place(trainer: Settings) -> None:
+    """Compares devices and nodes with the processes that are there, and fills in ``num_nodes``.
+
+    Raises:
+        InputError: they do not fit.
+    """
+    world = find_world()
+    if not trainer.get("num_nodes"):
+        trainer.pop("num_nodes", None)
+    nodes, devices = trainer.get("num_nodes"), trainer.get("devices", 1)
+    if world is not None:
+        _compare(world, devices, nodes or world.nodes, trainer.get("strategy", "auto"))
+        nodes = world.nodes
+    elif nodes and nodes > 1:
+        raise InputError(
+            f"trainer.num_nodes={nodes}: no process runs on other nodes; start the command on each of them "
+            "by torchrun or srun, or set trainer=ddp trainer.devices=... for one"
+        )
+    trainer.pop("num_nodes", None)  # one node is the same as none named
+    if nodes and nodes > 1:
+        trainer["num_nodes"] = nodes
+
+
+def _compare(world: World, devices: Any, nodes: int, strategy: str) -> None:
+    """Raises:
+    InputError: the processes of the world are not those of the Trainer.
+    """
+    if world.size > 1 and strategy == "auto":
+        raise InputError(
+            f"trainer.strategy=auto: {world.starter} has started {world.size} processes; set trainer=ddp, "
+            "which lets them train together"
+        )
+    count = len(devices) if isinstance(devices, list) else devices
+    if (count, nodes) != (world.per_node, world.nodes):
+        raise InputError(
+            f"trainer.devices={devices} trainer.num_nodes={nodes}: {world.starter} has started {world.size} "
+            f"processes, {world.per_node} on each node; set trainer.devices={world.per_node} "
+            f"+trainer.num_nodes={world.nodes}, or leave both out"
+        )
 
 
 def refuse_options_of_training(trainer: Settings) -> None:
