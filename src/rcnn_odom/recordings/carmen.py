@@ -24,6 +24,7 @@ from rcnn_odom.recordings.carmen_log.truth import (
     wheel_odometry,
 )
 from rcnn_odom.recordings.recording import Recording
+from rcnn_odom.recordings.reference import MATCHER
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.text import lines_of, need_text
@@ -56,7 +57,8 @@ def load(
         name: the log's file name, with or without .log or .clf and .gz, .bz2, .xz or .zst.
         root: the folder of the log.
         reference: a table (.csv) with ``raw_scan_index, ref_x, ref_y, ref_theta`` for every scan, or a
-            folder that holds ``NAME_dense_ref.csv``. nan there is an unknown truth.
+            folder that holds ``NAME_dense_ref.csv``. nan there is an unknown truth. ``matcher``: the poses
+            are nan, to be filled in by scan matching.
         field_of_view_deg: degrees that the beams of FLASER lines cover. None: as the log's PARAM lines say,
             and 180 where they do not.
         max_range: metres; readings at or beyond it are counted in the notes as no returns. None: only
@@ -96,6 +98,8 @@ def _find_truth(
     lines: list[LaserLine], name: str, reference: str | Path | None
 ) -> tuple[FloatArray, list[str]]:
     """Poses (N, 4, 4) of the laser by the log itself or by its reference, and words about them."""
+    if str(reference) == MATCHER:
+        return np.full((len(lines), 4, 4), np.nan), []
     if reference is None:
         return planar_to_poses([line.laser for line in lines]), name_truth(lines)
     return read_truth(find_reference(Path(reference), name), len(lines))

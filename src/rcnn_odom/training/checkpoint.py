@@ -1,5 +1,7 @@
 """Trained networks from disk, never trusting the file with more than numbers."""
 
+import hashlib
+from dataclasses import asdict
 from pathlib import Path
 from pickle import UnpicklingError
 from typing import Any
@@ -94,12 +96,42 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
         raise _refusal(path, error) from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
-    if sensor is not None and (own := Sensor(**settings["sensor"])) != sensor:
-        raise InputError(
-            f"{path}: trained for {own}, but the data has {sensor}; "
-            "set data.sensor as in training, or train on this data"
-        )
+    if sensor is not None:
+        _compare_sensors(path, Sensor(**settings["sensor"]), sensor)
     return module.eval()
+
+
+def _compare_sensors(path: str | Path, own: Sensor, sensor: Sensor) -> None:
+    """Refuses a network whose sensor is another one than the data's; names what differs.
+
+    Raises:
+        InputError: it is.
+    """
+    theirs, ours = asdict(own), asdict(sensor)
+    others = [name for name in ours if theirs[name] != ours[name]]
+    if others:
+        need = " ".join(f"data.sensor.{name}={theirs[name]}" for name in others)
+        have = " and ".join(f"{name}={ours[name]}" for name in others)
+        raise InputError(
+            f"{path}: trained with {need}, but the data has {have}; set data.sensor as in training, or train "
+            "on this data"
+        )
+
+
+def weights_fingerprint(path: str | Path) -> str:
+    """Hash of the weights and scales in a checkpoint, wherever the file is.
+
+    Raises:
+        InputError: as :func:`read_checkpoint`.
+    """
+    saved, digest = read_checkpoint(path), hashlib.sha256()
+    try:
+        for name, value in sorted(saved["state_dict"].items()):
+            digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
+            digest.update(value.contiguous().view(-1).numpy().tobytes())
+    except Exception as error:  # whatever a stranger's file holds
+        raise _refusal(path, error) from error
+    return digest.hexdigest()[:16]
 
 
 def _upgrade(saved: dict[str, Any]) -> None:

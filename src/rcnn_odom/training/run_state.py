@@ -40,8 +40,10 @@ PACKAGE = Path(__file__).parents[1]
 DECIDING = (
     "geometry.py",
     *("models/*.py", "recordings/**/*.py", "simulation/**/*.py"),
-    *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/fresh_worlds.py"),
+    *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/augmentation.py"),
+    "training/fresh_worlds.py",
     *("training/stages.py", "training/checkpoint.py", "training/saving.py", "training/machine.py"),
+    *("training/pretrained.py", "training/matcher_truth.py"),
     *("evaluation/drift.py", "evaluation/drift_metric.py"),
 )
 """Sources that decide what a training gives."""
@@ -252,8 +254,21 @@ def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -
         data["fresh_worlds"] = settings["data"]["reader"]
     trainer = {name: value for name, value in settings["trainer"].items() if name not in WITHOUT_EFFECT}
     precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
-    parts = [recordings, data, settings["model"], trainer | {"precision": precision}, settings["seed"]]
+    model = _name_weights(settings["model"])
+    parts = [recordings, data, model, trainer | {"precision": precision}, settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
+
+
+def _name_weights(model: Settings) -> Settings:
+    """The options of a model with the hash of the weights that it begins with, in place of their file."""
+    from rcnn_odom.training.checkpoint import weights_fingerprint  # with torch, which would make --help slow
+
+    named = {name: value for name, value in model.items() if name != "pretrained"}
+    if model.get("pretrained"):
+        named["pretrained"] = weights_fingerprint(model["pretrained"])
+    if model.get("first_stage"):
+        named["first_stage"] = _name_weights(model["first_stage"])
+    return named
 
 
 def code_fingerprint(package: Path, others: Iterable[Path] = ()) -> str:
@@ -264,8 +279,13 @@ def code_fingerprint(package: Path, others: Iterable[Path] = ()) -> str:
         others: source files outside of it; those inside count once.
     """
     inside = {path for pattern in DECIDING for path in package.glob(pattern)}
+    return hash_statements([*sorted(inside), *sorted(set(others) - inside)])
+
+
+def hash_statements(sources: Iterable[Path]) -> str:
+    """Hash of the statements in source files, in this order."""
     statements = hashlib.sha256()
-    for path in [*sorted(inside), *sorted(set(others) - inside)]:
+    for path in sources:
         tree = ast.parse(path.read_bytes())
         for node in ast.walk(tree):
             body = getattr(node, "body", None)
