@@ -258,6 +258,31 @@ def change_step_frame(step: Step, laser_pose: tuple[float, float, float]) -> Ste
     )
 
 
+def relative_covariance(step: Step, earlier: FloatArray, later: FloatArray) -> FloatArray:
+    """The covariance (3, 3) of a step between two poses whose errors are independent.
+
+    To first order, in the frame of the earlier pose.
+
+    Args:
+        step: from the earlier to the later pose.
+        earlier, later: (3, 3) covariances of the two poses, each in its own frame.
+
+    >>> turned = np.diag([0.0, 0.0, 0.01])
+    >>> relative_covariance(Step(2.0, 0.0, 0.0), turned, np.zeros((3, 3))).round(6).tolist()
+    [[0.0, 0.0, 0.0], [0.0, 0.04, 0.02], [0.0, 0.02, 0.01]]
+    """
+    return _carry(_lever(step.x, step.y), earlier) + _carry(_turn(step.heading), later)
+
+
+def turn_covariance(covariance: FloatArray, heading: float) -> FloatArray:
+    """A covariance (3, 3) of x, y and heading, told of a frame that sees it turned by ``heading`` radians.
+
+    >>> turn_covariance(np.diag([1.0, 4.0, 0.1]), np.pi / 2).round(6).tolist()
+    [[4.0, -0.0, 0.0], [-0.0, 1.0, 0.0], [0.0, 0.0, 0.1]]
+    """
+    return _carry(_turn(heading), covariance)
+
+
 def turn_to_middle(step: Step) -> Step:
     """A step told of the heading in mid-turn: what the body itself moves, divided by the time its velocity.
 

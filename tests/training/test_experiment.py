@@ -211,7 +211,7 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(trained, c
     recurrent = ["model=rcnn_reg", *kitti]
     for number, (run, option, message) in enumerate(
         [
-            ("cnn_reg", "seed=0", "cnn_reg, but cnn_cls is needed"),
+            ("cnn_reg", "seed=0", "cnn_reg, but rcnn_reg is needed, or of cnn_cls, its first stage"),
             ("cnn_cls", "data.sensor.max_range=50.0", "max_range=80.0.*data has"),
             ("cnn_cls", "model.kernel_size=5", "kernel_size=3, but model.kernel_size is 5"),
             ("missing", "seed=0", "no such checkpoint"),
@@ -241,6 +241,14 @@ def test_a_checkpoint_of_another_variant_sensor_or_network_is_refused(trained, c
         ("data.sensor.max_range=far", "must be a number above 0"),
         ("data.augment.mirror=maybe", "must be true or false"),
         ("data.augment.max_turn_deg=abc", "must be 0 or a positive number"),
+        ("data.augment.move=[1,2]", "must be null or three deviations"),
+        ("data.augment.move=[1,-2,0]", "must be null or three deviations"),
+        ("data.augment.move=[1000,0,0]", "two scans would have nothing in common; at most 20 m"),
+        ("data.augment.max_range_scale=0.5", "must be a number from 1"),
+        ("data.augment.lost_beams=1", "below|less than 1"),
+        ("data.augment.beam_pattern=[0.3,0.05]", "the least and the largest spacing in degrees"),
+        ("data.augment.beam_pattern=[0.05,0.3]", "from 0.5 degrees, half a bin"),
+        ("model.stride=0", "must be null or a whole number above 0"),
         ("data.workers=-1", "must be null or a whole number"),
         ("data.ring=-1", "not negative"),
         ("data.sensor.resolution_deg=60.0", "too few for the network"),
@@ -323,6 +331,7 @@ STUB = [
     "data=simulated",
     "data.reader.format=stub_drives",
     "data.train=['00','02']",
+    "data.val=['10']",
     "data.test=['05']",
     "data.sensor.max_range=40.0",
     LENGTHS,
@@ -494,7 +503,7 @@ def test_a_foreign_configuration_is_refused(configure, tmp_path, content):
         pytest.param(["train.py", "data=kitti"], "data.root is missing", marks=pytest.mark.slow),
         pytest.param(["train.py", "data=kitti", "data.root=nowhere"], "nowhere", marks=pytest.mark.slow),
         (["train.py", "model.kernel=3"], "model.kernel: there is no such option; --help"),
-        (["train.py", "data=kiti"], "data=kiti: there is no such choice; there are carmen"),
+        (["train.py", "data=kiti"], "data=kiti: there is no such choice; there are all_round, blind, carmen"),
         pytest.param(["evaluate.py", "run=nowhere"], "nowhere/config.yaml", marks=pytest.mark.slow),
     ],
 )
@@ -510,7 +519,7 @@ def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, argum
 def test_help_prints_the_options():
     command = [sys.executable, str(ROOT / "train.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert "data: carmen, indoor, kitti" in done.stdout
+    assert "data: all_round, blind, carmen, indoor, kitti" in done.stdout
     assert "kernel_size: 3" in done.stdout
 
 

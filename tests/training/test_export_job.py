@@ -9,9 +9,9 @@ import torch
 
 from odometry import random_scans
 from rcnn_odom.cli import main
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST, METRICS
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.trained import TorchStepper
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training import export as export_job

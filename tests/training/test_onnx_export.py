@@ -10,10 +10,10 @@ import torch
 from onnx import numpy_helper
 
 from odometry import NAMES, SENSOR, build, random_scans
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import Step, advance
 from rcnn_odom.models.encoding import Sensor, encode
+from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.trained import TorchStepper, TrainedModel
 from rcnn_odom.training.onnx_graph import check, to_onnx, write, write_metadata
 

@@ -29,7 +29,11 @@ from rcnn_odom.training.windows import Windows
 from train import train
 
 # The networks of a configuration, with all that draws at random.
-VARIED = ["model.dropout=0.2", "data.augment.mirror=true", "data.augment.max_turn_deg=5"]
+VARIED = [
+    *("model.dropout=0.2", "data.augment.mirror=true", "data.augment.max_turn_deg=5"),
+    *("data.augment.move=[0.3,0.1,2]", "data.augment.max_range_scale=1.2", "data.augment.beam_pattern=[1,4]"),
+    *("data.augment.lost_beams=0.2", "data.augment.lost_sector_deg=40", "data.augment.noise=0.05"),
+]
 
 
 class Killed(BaseException):
@@ -72,10 +76,10 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
     options = [f"model={variant}", *kitti, *VARIED]
     if variant == "rcnn_reg":  # the first stage is the other variant's test
         train(configure("model=cnn_cls", *kitti, run="cnn"))
-        options += [f"model.pretrained={tmp_path}/outputs/cnn/{BEST}", "model.batch_size=2"]
+        options += [f"model.pretrained={tmp_path}/outputs/cnn/{BEST}", "model.batch_size=2", "model.stride=6"]
     train(configure(*options, run="whole"))
     whole = result_of(tmp_path / "outputs" / "whole")
-    epoch = 7 if variant == "cnn_cls" else 3
+    epoch = 7 if variant == "cnn_cls" else 4
     for step in range(1, 2 * epoch + 1):
         run = f"killed_{step}"
         kill_after(monkeypatch, step, lambda run=run: train(configure(*options, run=run)))
@@ -141,7 +145,8 @@ def command(tmp_path, kitti):
     script.write_text(COMMAND)
 
     def command(outputs, *options):
-        every = [*SMALL, *kitti, "model=rcnn_reg", "model.hidden_size=64", "model.window=8", *VARIED]
+        every = [*SMALL, *kitti, "model=rcnn_reg", "model.hidden_size=64", *VARIED]
+        every += ["model.window=8", "model.stride=4"]
         every += ["model.epochs=40", "model.first_stage.epochs=40", "model.first_stage.batch_size=4"]
         every += ["model.batch_size=2", f"outputs={outputs}", *options]
         environment = os.environ | {"OMP_NUM_THREADS": "1"}

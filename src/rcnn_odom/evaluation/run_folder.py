@@ -33,6 +33,29 @@ def home_of(run: Path) -> Path:
     return Path(os.path.relpath((run / CONFIG).resolve().parent)) if (run / CONFIG).is_symlink() else run
 
 
+def find_weights(path: Path) -> Path:
+    """The file of the best weights of a finished run; a path that is no folder as it is.
+
+    ``outputs/latest`` shows a fine-tuning as soon as that has begun. Until it has finished, ``latest`` stands
+    for the weights that it began with, so that the same command goes on with the same weights.
+
+    Args:
+        path: of a checkpoint, of a run's folder, or of ``outputs/latest``.
+
+    Raises:
+        InputError: the folder is none of a run, or of one that has not finished.
+    """
+    if not path.is_dir():
+        return path
+    run, settings = home_of(path), read_settings(path)
+    if has_finished(run):
+        return run / BEST
+    begun_with = settings["model"].get("pretrained")
+    if begun_with and (path / CONFIG).is_symlink():
+        return Path(begun_with)
+    raise InputError(f"{path}: a run that has not finished; let it finish, or give its {BEST}")
+
+
 def read_settings(run: Path, groups: Collection[str] = ("data", "model", "trainer")) -> Settings:
     """The configuration that a run was started with.
 

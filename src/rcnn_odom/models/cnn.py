@@ -89,18 +89,28 @@ class Encoder(nn.Module):
         sensor: whose depth vectors it is given; ranges are divided by its ``max_range``.
         kernel_size: odd; the paper chose 3 and tried 5 and 7.
         pooling: ``avg`` (the paper's choice) or ``max``.
+        inputs: channels of an image; 2: the two scans.
+
+    Attributes:
+        channels, places, features: of the output, and the product of the two.
 
     Raises:
         InputError: there are too few bins for six layers.
         ValueError: the kernel has no middle.
     """
 
-    def __init__(self, sensor: Sensor, kernel_size: int = 3, pooling: Literal["avg", "max"] = "avg") -> None:
+    def __init__(
+        self,
+        sensor: Sensor,
+        kernel_size: int = 3,
+        pooling: Literal["avg", "max"] = "avg",
+        inputs: int = 2,
+    ) -> None:
         super().__init__()
         if kernel_size % 2 == 0:
             raise ValueError(f"kernel_size must be odd, not {kernel_size}: padding could not keep the length")
         layers: list[nn.Module] = []
-        length, inputs = sensor.bins, 2
+        length = sensor.bins
         for number, (channels, stride) in enumerate(zip(CHANNELS, STRIDES, strict=True)):
             if number in (2, 4):
                 pool = {"avg": nn.AvgPool2d, "max": nn.MaxPool2d}[pooling]
@@ -119,20 +129,26 @@ class Encoder(nn.Module):
             )
         self.layers = nn.Sequential(*layers)
         self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.max_range, self.features = sensor.max_range, inputs * length
+        self.max_range, self.channels, self.places = sensor.max_range, inputs, length
+        self.features = inputs * length
 
     def forward(self, pairs: Tensor) -> Tensor:
         """Features (..., features) of pairs (..., 2, bins) in metres, the earlier scan first."""
         image = self.lay_out((pairs / self.max_range).flatten(0, -3))
+        return self.convolve(image).flatten(1).unflatten(0, pairs.shape[:-2])
+
+    def convolve(self, image: Tensor) -> Tensor:
+        """Features (N, channels, 1, places) of images (N, inputs, 1, bins)."""
         # The motion shows in small differences between two scans: bf16 would round them away before the
         # first layer can take them.
-        with torch.autocast(pairs.device.type, enabled=False):
+        with torch.autocast(image.device.type, enabled=False):
             image = self.layers[0](image)
-        if torch.is_autocast_enabled(pairs.device.type):
+        if torch.is_autocast_enabled(image.device.type):
             # The next layer rounds anyway: before the ReLU instead of after it, the result is the same
             # and half as many bytes pass through memory.
-            image = image.to(torch.get_autocast_dtype(pairs.device.type))
-        return self.layers[1:](image).flatten(1).unflatten(0, pairs.shape[:-2])
+            image = image.to(torch.get_autocast_dtype(image.device.type))
+        convolved: Tensor = self.layers[1:](image)
+        return convolved
 
     def lay_out(self, pairs: Tensor) -> Tensor:
         """Images (B, 2, 1, bins) whose two scans are innermost in memory: the channels-last layout."""
@@ -197,6 +213,7 @@ class TwoNumberModel(TrainedModel):
         classifies: the head's rotation is a classification.
     """
 
+    only_in_training: ClassVar[tuple[str, ...]] = ("beta", "per_sample_norm", "dropout")
     classifies: ClassVar[bool]
     head: MotionHead
 

@@ -86,7 +86,7 @@ def check_model(name: str, model: Any) -> None:
         missing.append(" or ".join(NEEDED_IN_A_STREAM))
     if not missing and is_dataclass(model.Options) and trains:
         given = {each.name for each in fields(model.Options)}
-        wanted = RECIPE | ({"first_stage", "pretrained"} if model.first_stage else set())
+        wanted = RECIPE | ({"first_stage"} if model.first_stage else set())
         missing = [f"the option {each}" for each in sorted(wanted - given)]
         if model.first_stage and model.take_first_stage.__qualname__.startswith("TrainedModel."):
             missing.append("take_first_stage")

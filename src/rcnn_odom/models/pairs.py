@@ -19,6 +19,15 @@ OTHER_LASER = "other laser"
 """Kind of trouble."""
 
 
+def as_used(network: Stepper) -> Stepper:
+    """What steps through encoded scans: a network itself, or what predicts and warps for it."""
+    if network.description.warping is None:
+        return network
+    from rcnn_odom.models.warping import WarpingStepper  # compiled code, which other networks do not need
+
+    return network if isinstance(network, WarpingStepper) else WarpingStepper(network)
+
+
 class PairTracker:
     """A :class:`rcnn_odom.models.streaming.ScanTracker` of a model of pairs of depth vectors.
 
@@ -45,7 +54,7 @@ class PairTracker:
     """
 
     def __init__(self, stepper: Stepper) -> None:
-        self._stepper = stepper
+        self._stepper = as_used(stepper)
         self.description, self.period = stepper.description, stepper.description.period
         self._forget()
 
@@ -59,7 +68,8 @@ class PairTracker:
         self._present: npt.NDArray[np.float32] | None = None  # the last scan
         self._motion, self._held, self._missed = np.zeros(3), 0, 0
         self._beams, self._spacing = 0, 0.0
-        self.beam_check = BeamCheck(self.description.sensor)
+        # Surfaces are drawn alike whatever the beams: they may be fewer than the sensor's, on a part of it.
+        self.beam_check = BeamCheck(self.description.sensor, partly=self.description.warping is not None)
 
     @property
     def has_seen(self) -> bool:

@@ -3,7 +3,7 @@
 import logging
 import math
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
@@ -40,7 +40,6 @@ class RCNNOptions(CNNOptions):
     hidden_size: int = option(above=0)
     layers: int = option(above=0)
     projection: int | None = option(above=0)
-    pretrained: str | None
     freeze: bool
     first_stage: FirstStageOptions
 
@@ -115,6 +114,7 @@ class RecurrentModel(TwoNumberModel):
 
     Options = RCNNOptions
     first_stage = CNNClassification.name
+    only_in_training: ClassVar[tuple[str, ...]] = (*TwoNumberModel.only_in_training, "freeze")
 
     def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
         super().__init__(options, sensor)

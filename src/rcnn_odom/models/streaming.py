@@ -1,6 +1,6 @@
 """What a model is in a stream: of pairs of encoded scans, or of whole scans."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
@@ -9,6 +9,32 @@ import numpy.typing as npt
 from rcnn_odom.geometry import FloatArray, Step
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.scan import Scan
+
+
+@dataclass(frozen=True)
+class Warping:
+    """How a network that measures residual motions is used.
+
+    Attributes:
+        resolution_deg: width of the bins that scans are drawn into; None: that of the sensor.
+        passes: how often each scan is compared at most, each time with the earlier scan seen from the last
+            estimate.
+        settled: metres; a scan is not compared again after a correction of less than that, or of as many
+            times 0.05 radians.
+        key_distance, key_turn_deg: metres and degrees from the key scan, with which all scans are compared,
+            from which on the present scan takes its place. 0: every scan, so that each is compared with the
+            one before.
+    """
+
+    resolution_deg: float | None
+    passes: int
+    settled: float
+    key_distance: float
+    key_turn_deg: float
+
+    def drawn(self, sensor: Sensor) -> Sensor:
+        """The bins that scans of a sensor are drawn into."""
+        return replace(sensor, resolution_deg=self.resolution_deg or sensor.resolution_deg)
 
 
 @dataclass(frozen=True)
@@ -21,12 +47,19 @@ class Description:
             a step may be that is not known at all. nan if unknown.
         least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
         period: usual seconds between scans in training; nan if unknown.
+        warping: how a network that measures residual motions is used; None: it is given pairs as they are.
     """
 
     sensor: Sensor
     typical_step: tuple[float, float, float] = (np.nan, np.nan, np.nan)
     least_filled: float = np.nan
     period: float = np.nan
+    warping: Warping | None = None
+
+    @property
+    def input_sensor(self) -> Sensor:
+        """The bins of the pairs that the network itself is given."""
+        return self.sensor if self.warping is None else self.warping.drawn(self.sensor)
 
 
 class Stepper(Protocol):

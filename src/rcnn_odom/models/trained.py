@@ -13,6 +13,8 @@ from torch import Tensor, nn
 from rcnn_odom.geometry import FloatArray, Step, Steps
 from rcnn_odom.models.contract import Description, Model, Stepper
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import as_used
+from rcnn_odom.models.streaming import Warping
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
@@ -25,7 +27,7 @@ State = tuple[Tensor, ...]
 """What a network carries from pair to pair, in the order of :meth:`TrainedModel.initial_state`."""
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Recipe:
     """Options that every training has; ``Options`` of a network begin with them.
 
@@ -34,12 +36,19 @@ class Recipe:
         learning_rate: the top of the one-cycle rate.
         window: consecutive pairs in a training window.
         batch_size: windows in a batch.
+        stride: frames between the beginnings of training windows; None: as many as the window has pairs.
+        repeat: how often each window comes in an epoch, each time augmented in another way.
+        pretrained: checkpoint whose weights training begins with, of the same model or of its first stage;
+            None: random weights, and a first stage that is found or trained.
     """
 
     epochs: int = option(above=0)
     learning_rate: float = option(above=0)
     window: int = option(above=0)
     batch_size: int = option(above=0)
+    stride: int | None = option(default=None, above=0)
+    repeat: int = option(default=1, above=0)
+    pretrained: str | None = None
 
 
 def chunks_of_pairs(scans: Tensor) -> Iterator[Tensor]:
@@ -59,7 +68,11 @@ class TrainedModel(nn.Module, Model):
     Attributes:
         first_stage: name of a model that is trained before this one; its options are ``model.first_stage``.
             None: there is none.
-        typical_step: (3,) root mean square of the training steps, metres and radians.
+        only_in_training: options beside the recipe's that do not change what trained weights compute, such as
+            those of the loss: a checkpoint with other values of them can be fine-tuned.
+        warping: how a network that measures residual motions is used; see :class:`.streaming.Warping`.
+        typical_step: (3,) root mean square of the training steps, metres and radians; not for
+            :meth:`forward`, since fine-tuning changes it under the same weights.
         least_filled: share of bins with a return below which a scan is unlike any validation scan; nan
             before :meth:`calibrate`.
         period: usual seconds between validation scans; nan before :meth:`calibrate`.
@@ -67,6 +80,8 @@ class TrainedModel(nn.Module, Model):
 
     trains: ClassVar[bool] = True
     first_stage: ClassVar[str | None] = None
+    only_in_training: ClassVar[tuple[str, ...]] = ()
+    warping: Warping | None = None
     typical_step: Tensor
     least_filled: Tensor
     period: Tensor
@@ -106,6 +121,19 @@ class TrainedModel(nn.Module, Model):
     def set_units(self, steps: FloatArray) -> None:
         """Told the training drives' steps (N, 3) before training, for the scales of inputs and outputs."""
         self.typical_step.copy_(torch.from_numpy(np.sqrt(np.square(steps).mean(0))))
+
+    def take_weights(self, model: "TrainedModel") -> None:
+        """Takes the weights of a trained network with the same options, to train them further.
+
+        The scales that :meth:`set_units` had given that network come with its weights, which mean nothing in
+        others; ``typical_step`` stays that of the new training drives.
+
+        Raises:
+            RuntimeError: the weights have other shapes or names.
+        """
+        typical_step = self.typical_step.clone()
+        self.load_state_dict(model.state_dict())
+        self.typical_step.copy_(typical_step)
 
     def take_first_stage(self, model: "TrainedModel") -> None:
         """Takes what it needs of its trained first stage.
@@ -155,11 +183,13 @@ class TrainedModel(nn.Module, Model):
     def describe(self) -> Description:
         """What an odometer has to know."""
         x, y, heading = self.typical_step.double().tolist()
-        return Description(self.sensor, (x, y, heading), float(self.least_filled), float(self.period))
+        return Description(
+            self.sensor, (x, y, heading), float(self.least_filled), float(self.period), self.warping
+        )
 
     def stepper(self) -> Stepper:
         """One pair after the other, computed by PyTorch; robots run the exported file, which is faster."""
-        return TorchStepper(self)
+        return as_used(TorchStepper(self))
 
 
 class TorchStepper:

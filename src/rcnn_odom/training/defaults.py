@@ -4,17 +4,33 @@ from fnmatch import fnmatch
 
 from omegaconf import DictConfig
 
-TABLE: tuple[tuple[str, str, str, str, float], ...] = (
-    # option, model, data, data.scale: its default. The first row that fits counts.
-    ("beta", "*_cls", "carmen", "*", 0.03),
-    ("beta", "*_cls", "indoor", "*", 0.03),
-    ("beta", "*_cls", "*", "*", 1.0),
-    ("beta", "*", "carmen", "*", 5.0),  # a robot's steps are centimetres
-    ("beta", "*", "indoor", "*", 5.0),
-    ("beta", "*", "*", "*", 100.0),  # radians are small, classes are not
-    ("width_deg", "*", "carmen", "*", 0.5),  # robots turn on the spot
-    ("width_deg", "*", "indoor", "*", 0.5),
-    ("width_deg", "*", "*", "*", 0.1),
+INDOORS = "carmen", "half_circle", "indoor", "logs", "mixed"
+"""Data of robots, whose steps are centimetres and which turn on the spot."""
+
+Row = tuple[str, str, str, str, float]
+"""Option, model, data, ``data.scale``, and the option's default."""
+
+
+def _by_place(option: str, model: str, indoors: float, elsewhere: float) -> list[Row]:
+    rows: list[Row] = [(option, model, data, "*", indoors) for data in INDOORS]
+    return [*rows, (option, model, "*", "*", elsewhere)]
+
+
+TABLE: tuple[Row, ...] = (
+    # The first row that fits counts.
+    *_by_place("beta", "*_cls", 0.03, 1.0),
+    *_by_place("beta", "*", 5.0, 100.0),  # radians are small, classes are not
+    *_by_place("width_deg", "*", 0.5, 0.1),
+    # A step of 5 cm is small beside bins of a degree; half of the paper's bins hold no return of an HDL-64.
+    *_by_place("drawn_deg", "*", 0.5, 0.2),
+    *_by_place("key_distance", "*", 0.5, 2.0),
+    *_by_place("residual_x", "*", 0.15, 0.5),
+    *_by_place("residual_y", "*", 0.1, 0.2),
+    *_by_place("residual_heading_deg", "*", 5.0, 1.5),
+    ("repeat", "*", "*", "small", 8),  # each time with another guess
+    ("repeat", "*", "*", "*", 1),
+    ("epochs", "rcnn_warp", "*", "small", 10),
+    ("epochs", "cnn_warp", "*", "small", 12),
     ("epochs", "rcnn_*", "*", "small", 20),  # an epoch of the small set has few steps
     ("epochs", "*", "*", "small", 50),
     ("epochs", "rcnn_*", "*", "*", 5),
@@ -26,7 +42,7 @@ def default(option: str, *, _parent_: DictConfig, _root_: DictConfig) -> float:
     """The default of a model's option.
 
     Args:
-        option: its name, ``beta``, ``width_deg`` or ``epochs``.
+        option: its name, for instance ``epochs``.
         _parent_: the options that it stands among or one group below, which OmegaConf gives.
         _root_: the whole configuration, which OmegaConf gives.
     """

@@ -8,14 +8,14 @@ import numpy as np
 from tqdm import tqdm
 
 from rcnn_odom.deployment.odometer import Odometer
-from rcnn_odom.deployment.onnx_model import OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import Settings, read_settings
 from rcnn_odom.evaluation.scores import coverage, coverage_table, score_all, table
 from rcnn_odom.geometry import Steps
 from rcnn_odom.models.contract import Stepper
-from rcnn_odom.models.pairs import PairTracker
+from rcnn_odom.models.onnx_stepper import OnnxStepper
+from rcnn_odom.models.pairs import PairTracker, as_used
 from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive
@@ -136,6 +136,7 @@ def _score(
 
 def stream_steps(stepper: Stepper, drive: Drive) -> Steps:
     """The steps of a drive, one pair of scans after the other."""
+    stepper = as_used(stepper)
     stepper.reset()
     frames = tqdm(range(len(drive) - 1), desc=drive.name, unit="scan", disable=None, leave=False)
     steps = [stepper(np.array(drive.scans[frame : frame + 2])) for frame in frames]

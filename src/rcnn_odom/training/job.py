@@ -8,6 +8,7 @@ import signal
 import sys
 from collections.abc import Callable
 from contextlib import suppress
+from functools import partial
 from pathlib import Path
 from typing import TypeVar
 
@@ -19,6 +20,7 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import ERROR
+from rcnn_odom.training import cluster
 from rcnn_odom.training.overrides import explain, is_path, read_paths, written
 from rcnn_odom.training.run_state import find_stopped
 from rcnn_odom.training.settings import RENAMED, plain
@@ -80,6 +82,7 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
                 "hydra.job.chdir=true: paths are relative to where the command was started; leave it out"
             )
         if in_sweep():
+            cluster.refuse_sweep(cluster.find_world())
             if any(override.split("=")[0] == "run_dir" for override in HydraConfig.get().overrides.task):
                 raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
             (folder / ERROR).unlink(missing_ok=True)
@@ -112,9 +115,23 @@ def run_command(main: Callable[[], object]) -> int:
     show_any_text()
     try:
         sys.argv[1:] = read_paths(sys.argv[1:])
+        world = cluster.find_world()
+        if world is None or world.size == 1:
+            return _run(main)
+        if {"-m", "--multirun"} & set(sys.argv[1:]):
+            if world.rank > 0:  # the first process says why
+                return 1
+            cluster.refuse_sweep(world)
+        return cluster.run_in(world, partial(_run, main))
+    except KeyboardInterrupt:
+        return 130
     except InputError as error:
         print(f"error: {error}", file=sys.stderr)
         return 1
+
+
+def _run(main: Callable[[], object]) -> int:
+    """What :func:`run_command` gives, in the process that the command is run in."""
     try:
         main()
     except KeyboardInterrupt:

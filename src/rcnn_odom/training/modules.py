@@ -19,6 +19,7 @@ from rcnn_odom.geometry import FloatArray, Steps, change_frame
 from rcnn_odom.models.contract import find_model
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.trained import Batch, TrainedModel
+from rcnn_odom.training.cluster import has_joined
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import keep_freed_memory
 
@@ -68,9 +69,10 @@ class OdometryModule(L.LightningModule):
     def teardown(self, stage: str) -> None:
         """Lightning's hook at the end, in every process: lets go of the others.
 
-        A process that ends while it still holds the connection sometimes aborts.
+        A process that ends while it still holds the connection sometimes aborts. Processes that a cluster has
+        started do not end yet.
         """
-        if self.trainer.world_size > 1 and torch.distributed.is_initialized():
+        if self.trainer.world_size > 1 and not has_joined() and torch.distributed.is_initialized():
             torch.distributed.barrier()
             torch.distributed.destroy_process_group()
 

@@ -15,11 +15,11 @@ import torch
 from torch import Tensor, nn
 
 from rcnn_odom import __version__
-from rcnn_odom.deployment.onnx_model import FORMAT, METADATA, OnnxStepper
 from rcnn_odom.errors import InputError
 from rcnn_odom.files import write_atomically
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.models.contract import Stepper
+from rcnn_odom.models.onnx_stepper import FORMAT, METADATA, OnnxStepper
 from rcnn_odom.models.trained import TorchStepper, TrainedModel
 
 if TYPE_CHECKING:
@@ -47,6 +47,12 @@ Poses, from x = y = heading = 0: x += cos(heading) * step_x - sin(heading) * ste
 y += sin(heading) * step_x + cos(heading) * step_y; heading += step_heading.
 int8 files need ONNX Runtime, which has the operator MatMulNBits.
 The metadata "{key}" holds the sensor and what else an odometer needs, as JSON."""
+
+
+RESIDUAL = """
+This network measures residual motions. Its two depth vectors are drawn: their bins hold the range at which
+the middle of each meets the surfaces of a scan, and the earlier scan is seen from where the later one is
+expected. step is then where the later scan was taken, seen from there. rcnn_odom.models.warping does so."""
 
 
 class _Step(nn.Module):
@@ -106,7 +112,8 @@ def check(stepper: OnnxStepper, model: TrainedModel) -> None:
         InputError: it does not do what the model does.
     """
     rng = np.random.default_rng(0)
-    scans = rng.uniform(0, model.sensor.max_range, (CHECKED_STEPS + 1, model.sensor.bins))
+    sensor = model.describe().input_sensor
+    scans = rng.uniform(0, sensor.max_range, (CHECKED_STEPS + 1, sensor.bins))
     scans[rng.random(scans.shape) < 0.5] = 0
     pairs = [scans[frame : frame + 2].astype(np.float32) for frame in range(CHECKED_STEPS)]
     got, expected = (_stream(each, pairs) for each in (stepper, TorchStepper(model)))
@@ -151,7 +158,7 @@ def _trace(model: TrainedModel) -> "onnx.ModelProto":
     """The graph in fp32, every product a ``MatMul`` with its weights."""
     # One tensor for two states, as zeros may be, would make them one input.
     state = {name: value.clone() for name, value in model.initial_state().items()}
-    arguments = torch.zeros(1, 2, model.sensor.bins), *state.values()
+    arguments = torch.zeros(1, 2, model.describe().input_sensor.bins), *state.values()
     outputs = ["step", "covariance", *(f"{name}_out" for name in state)]
     with _quiet(), torch.no_grad():
         program = torch.onnx.export(
@@ -248,7 +255,8 @@ def _point_convolution(node: Any, weight: Any, constants: Any, rank: int) -> lis
 
 def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
     """In words what goes in and comes out."""
-    sensor, state = model.sensor, model.initial_state()
+    described = model.describe()
+    sensor, state = described.input_sensor, model.initial_state()
     names = " and ".join(f"{name} {tuple(value.shape)}" for name, value in state.items())
     after = " and ".join(f"{name}_out" for name in state)
     graph.doc_string = ABOUT.format(
@@ -260,6 +268,8 @@ def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
         circle=" The last bin repeats the first." if sensor.field_of_view_deg == 360 else "",
         key=METADATA,
     )
+    if described.warping is not None:
+        graph.doc_string += RESIDUAL
     graph.producer_name, graph.producer_version = "rcnn-odom", __version__
     for node in graph.graph.node:  # where each came from in this project's code, of no use to others
         del node.metadata_props[:]

@@ -4,8 +4,10 @@ import os
 import re
 import shlex
 from collections.abc import Sequence
+from pathlib import Path
 
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.run_folder import find_weights
 
 PATHS = ("root", "reference", "pretrained", "run", "run_dir", "outputs")
 """Options that may look like a number on the command line, ``data.root=2011``, and are a path."""
@@ -115,6 +117,10 @@ def _read_path(argument: str) -> str:
         raise InputError(f"{argument}: is an empty path; give one, or leave {name} out")
     if isinstance(value, bool | int | float) and str(value) != text:
         raise InputError(f"{argument}: Hydra reads {value}, which is no path; write {written(name, text)}")
-    if isinstance(value, str) and value.startswith("~"):
-        return f"{name}={quoted(os.path.expanduser(value))}"
-    return argument
+    if not isinstance(value, str):
+        return argument
+    path = os.path.expanduser(value) if value.startswith("~") else value
+    if name.split(".")[-1] == "pretrained":
+        # Here, since the first job of a sweep makes outputs/latest another run's.
+        path = str(find_weights(Path(path)))
+    return argument if path == value else f"{name}={quoted(path)}"

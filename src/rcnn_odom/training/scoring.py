@@ -42,7 +42,7 @@ def evaluate(cfg: DictConfig) -> Report:
         )
     if variant and not cfg.get("data"):
         raise InputError(
-            f"model={variant} needs recordings: add data=simulated, indoor, kitti, kitti_raw or carmen"
+            f"model={variant} needs recordings: add data=simulated, indoor, kitti, kitti_raw, carmen or logs"
         )
     chosen = plain(cfg)
     refuse_options_of_training(chosen["trainer"])
@@ -67,7 +67,7 @@ def _score_run(chosen: Settings) -> tuple[Settings, Report]:
             f"data.apply={apply}: the network was trained with {trained}; set data.apply={trained}"
         )
     datamodule = build_datamodule(settings).load(("test",))
-    scores = score_module(module, datamodule, trainer, settings["data"], folder)
+    scores = score_module(module, datamodule, trainer, settings, folder)
     of = {"run": os.path.relpath(home_of(run)), "variant": module.variant, "data": settings["data"]["name"]}
     return settings, {**of, **scores}
 

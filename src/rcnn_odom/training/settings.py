@@ -9,16 +9,24 @@ from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.evaluation.run_folder import Settings, flat
+from rcnn_odom.evaluation.run_folder import Settings, find_weights, flat
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.options import check_options, option
 from rcnn_odom.recordings.formats import find_format
 from rcnn_odom.training.defaults import default
 from rcnn_odom.training.overrides import PATHS
-from rcnn_odom.training.trainer_options import TrainerOptions, refuse_names, shorten_if_wanted
+from rcnn_odom.training.trainer_options import (
+    TrainerOptions,
+    place,
+    processes_per_node,
+    refuse_names,
+    shorten_if_wanted,
+)
 
 # For conf/model.
 OmegaConf.register_new_resolver("default", default, replace=True)
+# For conf/trainer.
+OmegaConf.register_new_resolver("processes_per_node", processes_per_node, replace=True)
 
 RENAMED = {
     "data.beta": "model.beta",
@@ -41,12 +49,30 @@ def _are_lengths(lengths: list[Any]) -> bool:
     return bool(lengths) and all(type(length) in (int, float) and 0 < length < 1e9 for length in lengths)
 
 
+def _are_numbers(values: list[Any], count: int) -> bool:
+    return len(values) == count and all(type(value) in (int, float) and 0 <= value < 1e9 for value in values)
+
+
 @dataclass(kw_only=True)
 class AugmentOptions:
-    """``data.augment``."""
+    """``data.augment``; see :class:`rcnn_odom.training.augmentation.Augmentation`."""
 
     mirror: bool
     max_turn_deg: float = option(least=0, wanted="0 or a positive number")
+    move: list[Any] | None = option(  # noqa: RUF009
+        default=None,
+        fits=lambda move: _are_numbers(move, 3),
+        wanted="null or three deviations: metres ahead, to the left, and degrees, for instance [0.3,0.1,2]",
+    )
+    max_range_scale: float = option(default=1.0, least=1, below=100)
+    lost_beams: float = option(default=0.0, least=0, below=1)
+    lost_sector_deg: float = option(default=0.0, least=0, wanted="0 or a positive number")
+    noise: float = option(default=0.0, least=0, wanted="0 or a positive number")
+    beam_pattern: list[Any] | None = option(  # noqa: RUF009
+        default=None,
+        fits=lambda spacings: _are_numbers(spacings, 2) and 0 < spacings[0] <= spacings[1],
+        wanted="null or the least and the largest spacing in degrees, for instance [0.05,0.3]",
+    )
 
 
 @dataclass(kw_only=True)
@@ -104,12 +130,14 @@ def plain(cfg: DictConfig) -> Settings:
         if isinstance(data[split], list):  # where [10] is a number to Hydra, and [00] is not
             data[split] = [str(name) for name in data[split]]
     _name_paths(settings)
+    _name_weights(settings.get("model") or {})
     _name_deskew(settings)
     _check(settings, complete=True)
     _refuse_deskew(settings)
     if (settings.get("model") or {}).get("apply", data.get("apply")) != data.get("apply"):
         raise InputError("model.apply is that of the data, by which the floor is scored too; set data.apply")
     shorten_if_wanted(settings)
+    place(settings.get("trainer") or {})
     return settings
 
 
@@ -129,6 +157,18 @@ def _check(settings: Settings, complete: bool) -> None:
 
         check_options(find_model(variant).Options, model, "model.", partly=not complete)
         settings["model"] |= model  # with the defaults of what was left out
+
+
+def _name_weights(model: Settings) -> None:
+    """Puts the checkpoint of a run in the place of its folder.
+
+    Raises:
+        InputError: as :func:`rcnn_odom.evaluation.run_folder.find_weights`.
+    """
+    if model.get("pretrained"):
+        model["pretrained"] = str(find_weights(Path(model["pretrained"])))
+    if isinstance(model.get("first_stage"), dict):
+        _name_weights(model["first_stage"])
 
 
 def _name_deskew(settings: Settings) -> None:

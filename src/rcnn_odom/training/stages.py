@@ -6,12 +6,14 @@ import shlex
 import shutil
 import sys
 import time
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import lightning as L
 from lightning.pytorch.loggers import TensorBoardLogger
-from lightning.pytorch.plugins.environments import LightningEnvironment
+from lightning.pytorch.plugins.environments import ClusterEnvironment, LightningEnvironment
 from lightning.pytorch.utilities.exceptions import MisconfigurationException
 
 from rcnn_odom.errors import InputError
@@ -24,11 +26,15 @@ from rcnn_odom.files import one_at_a_time
 from rcnn_odom.models.contract import find_model
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.formats import open_recording
+from rcnn_odom.recordings.reference import MATCHER
 from rcnn_odom.recordings.trajectory import flatten
 from rcnn_odom.training.checkpoint import calibrate, load_module, read_checkpoint
+from rcnn_odom.training.cluster import environment_of, find_world, has_joined, share
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import resolve_precision
+from rcnn_odom.training.matcher_truth import MatcherTruth
 from rcnn_odom.training.modules import OdometryModule, module_for, steps_per_epoch
+from rcnn_odom.training.pretrained import begin_with, options_of_network, read_pretrained, warn_if_worse
 from rcnn_odom.training.processes import one_line_errors
 from rcnn_odom.training.run_state import (
     Fingerprints,
@@ -47,21 +53,22 @@ from rcnn_odom.training.training_log import TrainingLog
 
 log = logging.getLogger(__name__)
 
-NOT_OF_THE_NETWORK = ("variant", "first_stage", "pretrained")
-"""Options that a checkpoint does not keep: it says what a network is, not where its first stage came from."""
-
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
     """The DataModule of a configuration; nothing has been read yet."""
     data, model = settings["data"], settings["model"]
-    recipe = {key: model[key] for key in ("window", "batch_size") if key in model}
+    cache = Path(settings["outputs"]) / "cache"
+    recordings = open_recording(data["reader"])
+    if data["reader"].get("reference") == MATCHER:
+        recordings = MatcherTruth(recordings, cache, data["deskew"])
+    recipe = {key: model[key] for key in ("window", "batch_size", "stride", "repeat") if key in model}
     return OdometryDataModule(
-        open_recording=open_recording(data["reader"]),
+        open_recording=recordings,
         train=data["train"],
         val=data["val"],
         test=data["test"],
         sensor=Sensor(**data["sensor"]),
-        cache_dir=Path(settings["outputs"]) / "cache",
+        cache_dir=cache,
         workers=data["workers"],
         seed=settings.get("seed", 0),
         fresh_epochs=model.get("epochs", 0) if data.get("fresh_worlds") else 0,
@@ -78,9 +85,8 @@ def build_module(settings: Settings, datamodule: OdometryDataModule) -> Odometry
     lengths = list(fitting_lengths(truths, data["lengths"]))
     if lengths != data["lengths"]:
         log.info("validation is too short for data.lengths: its drift is measured over %s m", lengths)
-    options = {key: value for key, value in model.items() if key not in NOT_OF_THE_NETWORK}
     L.seed_everything(settings["seed"], verbose=False)
-    module = module_for(model["variant"])(options, data["sensor"], lengths)
+    module = module_for(model["variant"])(options_of_network(model), data["sensor"], lengths)
     module.set_units(datamodule.training_steps())
     return module
 
@@ -97,12 +103,13 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
         raise InputError(
             f"trainer.devices={options['devices']}: several devices train by trainer=ddp trainer.devices=..."
         )
+    if find_world():  # what ddp_spawn would start is there
+        options["strategy"] = "ddp" if has_joined() else "auto"
     try:
         trainer = L.Trainer(
             **options,
             **(_training_options(settings, run) if run else {"logger": False, "enable_checkpointing": False}),
-            # Processes are started by this one wherever it runs, also in a job of Slurm.
-            plugins=[LightningEnvironment(), AtomicCheckpointIO()],
+            plugins=[_environment(), AtomicCheckpointIO()],
             use_distributed_sampler=False,
             enable_model_summary=False,
             enable_progress_bar=sys.stderr.isatty(),
@@ -118,6 +125,19 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
             f"multiple of {devices}"
         )
     return trainer
+
+
+def _environment() -> ClusterEnvironment:
+    """Who starts processes: something else that has, or this one wherever it runs, also in a job of Slurm."""
+    world = find_world() if has_joined() else None
+    return environment_of(world) if world else LightningEnvironment()
+
+
+def _builder(trainer: L.Trainer, settings: Settings) -> Callable[[], L.Trainer]:
+    """Builds a Trainer like this one in another process, whatever precision its own processor has."""
+    options = settings["trainer"] | {"precision": trainer.precision}
+    run = Path(settings["run_dir"]) if trainer.logger else None
+    return partial(build_trainer, settings | {"trainer": options}, run)
 
 
 def _has_one_process(options: Settings) -> bool:
@@ -160,6 +180,7 @@ def train(settings: Settings, *, reuse: bool = False) -> Report | None:
     if reuse and state_of(run, settings).state is State.FINISHED:
         log.info("run %s is finished already", run)
         return read_metrics_file(run)
+    read_pretrained(settings)  # what does not fit is told before recordings are encoded
     try:
         trainer = build_trainer(settings, run)
         datamodule = build_datamodule(settings)
@@ -214,7 +235,7 @@ def train_module(
         metrics |= _fit(settings, datamodule, trainer, wanted)
     module = calibrate(run / BEST, datamodule.drives["val"])
     metrics |= {"variant": module.variant, "data": settings["data"]["name"]}
-    metrics |= score_module(module, datamodule, trainer, settings["data"], run)
+    metrics |= score_module(module, datamodule, trainer, settings, run)
     training = metrics["training"]
     if "stopped_by" not in training:
         assert isinstance(trainer.logger, TensorBoardLogger)
@@ -234,7 +255,8 @@ def _take_weights(twin: Path, run: Path) -> Report:
     log.info("the same training has been done in %s; its weights are taken", twin)
     (run / BEST).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(twin / BEST, run / BEST)
-    kept: Report = {key: metrics[key] for key in ("first_stage", "training", "val") if key in metrics}
+    told = ("pretrained", "first_stage", "training", "val")
+    kept: Report = {key: metrics[key] for key in told if key in metrics}
     return kept | {"same_as": metrics.get("same_as", str(twin))}
 
 
@@ -251,7 +273,7 @@ def _fit(
     last = run / LAST
     module = build_module(settings, datamodule)
     module.fingerprint, module.code = wanted
-    metrics = _begin_with_first_stage(module, settings, datamodule)
+    metrics = _begin_with_trained_weights(module, settings, datamodule)
     if last.exists():
         saved = read_checkpoint(last)
         check_checkpoint(last, saved, wanted)
@@ -261,15 +283,20 @@ def _fit(
     stopped = {}
     try:
         with one_line_errors(trainer):
-            trainer.fit(
-                module, datamodule=datamodule, ckpt_path=last if last.exists() else None, weights_only=True
-            )
+            go_on: Settings = {"ckpt_path": last if last.exists() else None, "weights_only": True}
+            datamodule.trainer = trainer
+            _ = datamodule.batches_per_epoch  # refuses too few windows here, not in every process
+            folders = [datamodule.cache_dir, run]
+            share(_builder(trainer, settings), "fit", module, datamodule, folders, **go_on)
+            trainer.fit(module, datamodule=datamodule, **go_on)
     except TimeUp:
         stopped = {"stopped_by": "trainer.max_time"}
     fitted = _read_fitted(run, steps_per_epoch(settings["trainer"].get("limit_train_batches"), datamodule))
     fitted["training"] |= stopped
     fitted["val"]["lengths"] = module.lengths
-    return metrics | fitted
+    metrics |= fitted
+    warn_if_worse(metrics)
+    return metrics
 
 
 def _read_fitted(run: Path, steps_per_epoch: int) -> Report:
@@ -298,21 +325,29 @@ def _saving_of(trainer: L.Trainer) -> Saving:
     return saving
 
 
-def _begin_with_first_stage(
+def _begin_with_trained_weights(
     module: OdometryModule, settings: Settings, datamodule: OdometryDataModule
 ) -> Report:
-    """Gives a model its trained first stage, if it has one; the part of ``metrics.json`` about it.
+    """Gives a model the weights of ``model.pretrained``, or a trained first stage if it has one.
+
+    Returns:
+        The part of ``metrics.json`` about them.
 
     Raises:
-        InputError: the first stage that was given does not fit.
-        TimeUp: it has not been finished.
+        InputError: what was given does not fit.
+        TimeUp: the first stage has not been finished.
     """
-    variant = module.model.first_stage
+    model, variant = settings["model"], module.model.first_stage
+    given = read_pretrained(settings)
+    if given is not None and given.variant == module.variant:
+        # New worlds that the given network has not seen, nor its first stage.
+        datamodule.fresh_first = given.model.options["epochs"] + model.get("first_stage", {}).get("epochs", 0)
+        return begin_with(given, module, model["pretrained"], datamodule)
     if variant is None:
         return {}
-    path = _find_first_stage(settings, datamodule, variant)
+    path = Path(model["pretrained"]) if given else _find_first_stage(settings, datamodule, variant)
     log.info("first stage: %s", path)
-    stage = load_module(path, variant, Sensor(**settings["data"]["sensor"]))
+    stage = given or load_module(path, variant, Sensor(**settings["data"]["sensor"]))
     try:
         module.model.take_first_stage(stage.model)
     except InputError as error:
@@ -323,7 +358,7 @@ def _begin_with_first_stage(
 
 
 def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, variant: str) -> Path:
-    """Checkpoint of the first stage: given, found among the runs, or trained now.
+    """Checkpoint of the first stage: found among the runs, or trained now.
 
     One that is found has the same recordings, network, recipe and seed, and was trained by the same code;
     only the own one of a run that was stopped is kept whatever the code, and the log says so.
@@ -332,8 +367,6 @@ def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, varian
         TimeUp: ``trainer.max_time`` has stopped its training.
     """
     model = settings["model"]
-    if model.get("pretrained"):
-        return Path(model["pretrained"])
     run, outputs = Path(settings["run_dir"]) / "first_stage", Path(settings["outputs"])
     settings = {**settings, "model": {**model["first_stage"], "variant": variant}, "run_dir": str(run)}
     stage_data = build_datamodule(settings)
@@ -358,7 +391,7 @@ def score_module(
     module: OdometryModule,
     datamodule: OdometryDataModule,
     trainer: L.Trainer,
-    data: Settings,
+    settings: Settings,
     folder: Path,
 ) -> Report:
     """Estimates the test drives with a network and scores it; a trainer's TensorBoard gets the figures.
@@ -367,11 +400,14 @@ def score_module(
         module: with the network.
         datamodule: with the test drives.
         trainer: tests, perhaps in other processes.
-        data, folder: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
+        settings: which the trainer was built with.
+        folder: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
     """
     with TemporaryDirectory() as shared, one_line_errors(trainer):
         # Other processes cannot hand their estimates over in memory.
         module.estimates_file = Path(shared) / "estimates" if trainer.world_size > 1 else None
+        folders = [datamodule.cache_dir]
+        share(_builder(trainer, settings), "test", module, datamodule, folders, verbose=False)
         trainer.test(module, datamodule=datamodule, verbose=False)
         if module.estimates_file:
             module.estimates = pickle.loads(module.estimates_file.read_bytes())
@@ -379,5 +415,5 @@ def score_module(
     latency = measure(module.model.stepper(), drives[0].scans)
     add_figure = logger.experiment.add_figure if isinstance(logger, TensorBoardLogger) else None
     return report_drives(
-        module.variant, module.estimates, mean_step, latency, drives, data, folder, add_figure
+        module.variant, module.estimates, mean_step, latency, drives, settings["data"], folder, add_figure
     )

@@ -1,0 +1,361 @@
+"""A network that measures what is left of a motion after a first guess (predict, warp, correct).
+
+Both scans are drawn as surfaces, the earlier one as seen from where the guess leads
+(:mod:`rcnn_odom.models.reprojection`), and the paper's six convolutions compare them. At each of their last
+places the network says how far the surface there is off, in which direction it can tell, and how surely; the
+residual motion is the weighted least-squares solution of all places, and its covariance the inverse of their
+information. So every place is judged alike, whatever its bearing, and a direction in which nothing is seen
+keeps the guess and gets a large deviation.
+
+Training draws the guesses: any pair of scans whose motion is known gives pairs of any residual motion.
+"""
+
+import math
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rcnn_odom.geometry import FloatArray, Steps, advance, compose, poses_to_planar, relative_step
+from rcnn_odom.models.cnn import Encoder
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.reprojection import DepthVector, render_many
+from rcnn_odom.models.streaming import Warping
+from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
+from rcnn_odom.models.uncertainty import WITHIN
+from rcnn_odom.models.warping import RADIANS_A_METRE
+from rcnn_odom.options import option
+from rcnn_odom.recordings.recording import Drive
+
+CHANNELS = 5
+"""Of an image of two scans: see :func:`compare`."""
+UNITS = (1.0, 1.0, RADIANS_A_METRE)
+"""Metres, metres and radians: what the head solves for, and the loss compares, so that all count alike."""
+FINE = 0.05
+"""Metres from which on a difference of ranges counts by its logarithm."""
+NEAR = 10.0
+"""Metres: the middle of the ranges, of which the logarithm is taken."""
+LOG_WEIGHT = (-12.0, 8.0)
+"""Bounds of the logarithm of a place's weight."""
+COVARIANCE_PART = 0.05
+"""Of the loss, of the likelihood by which the covariances are learned."""
+FROM_REST = 0.1
+"""Share of the guesses in training that are no motion at all, as at the beginning of a drive."""
+FARTHEST_FROM_REST, SHARPEST_FROM_REST = 3.0, 0.35
+"""Metres and radians of such residual motions at most."""
+
+
+@dataclass(frozen=True)
+class ResidualOptions:
+    """How far off the guesses are in training.
+
+    Attributes:
+        x, y: metres, standard deviations along and across the motion.
+        heading_deg: degrees.
+        smallest, largest: powers of ten between which each guess's deviations are scaled.
+    """
+
+    x: float = option(above=0)
+    y: float = option(above=0)
+    heading_deg: float = option(above=0)
+    smallest: float = option(fits=lambda power: -6 <= power <= 1, wanted="a number from -6 to 1")
+    largest: float = option(fits=lambda power: -6 <= power <= 1, wanted="a number from -6 to 1")
+
+
+@dataclass(kw_only=True)
+class WarpOptions(Recipe):
+    """What ``conf/model`` sets; the comments there say what each means."""
+
+    kernel_size: int = option(fits=lambda size: size > 0 and size % 2 == 1, wanted="odd; the paper uses 3")
+    pooling: str = option(choices=("avg", "max"))
+    resolution_deg: float | None = option(above=0)
+    passes: int = option(above=0)
+    settled: float = option(least=0)
+    key_distance: float = option(least=0)
+    key_turn_deg: float = option(above=0)
+    residual: ResidualOptions
+    floor: float = option(above=0)
+
+
+def compare(pairs: Tensor, sensor: Sensor) -> Tensor:
+    """Images (N, 5, 1, bins) of drawn pairs (N, 2, bins), the guess's scan first.
+
+    The channels: the difference of the ranges, linear up to some centimetres and logarithmic beyond; the
+    logarithm of the later scan's range; its slope (the tangent of the angle at which the surface is hit);
+    where the later scan sees something; where both do.
+
+    Args:
+        pairs: metres, 0 where nothing is seen.
+        sensor: the bins.
+    """
+    before, now = pairs.unbind(-2)
+    sees = now > 0
+    both = sees & (before > 0)
+    zero = now.new_zeros(())
+    difference = torch.where(both, torch.asinh((now - before) / FINE), zero) / 2
+    depth = torch.where(sees, torch.log(now.clamp(min=0.1) / NEAR), zero)
+    left, right = torch.roll(now, -1, -1), torch.roll(now, 1, -1)
+    across = 2 * math.radians(sensor.resolution_deg) * now.clamp(min=0.1)
+    slope = torch.where(sees & (left > 0) & (right > 0), torch.asinh((left - right) / across), zero) / 2
+    image = torch.stack([difference, depth, slope, sees.to(now.dtype), both.to(now.dtype)], -1)
+    return image.unsqueeze(1).permute(0, 3, 1, 2)  # channels innermost in memory, as the encoder wants them
+
+
+class LocalConstraints(nn.Module):
+    """The residual motion as the least-squares solution of what is seen at each place.
+
+    At place k the network gives a direction u (radial and tangential; its length is free), a lever arm l for
+    the heading, a residual r and a log weight: r = u . (x, y) + l * heading. The normal equations of all
+    places are solved with a prior that says that the guess is right, whose strength is learned; they are the
+    Gauss-Newton step of point-to-line matching with everything in it learned. The inverse of their matrix is
+    the covariance (Cholesky).
+
+    Args:
+        features: channels of the encoder's output.
+        places: how many the encoder's output has.
+        sensor: the bins drawn, around which the places are spread.
+    """
+
+    cos: Tensor
+    sin: Tensor
+    units: Tensor
+
+    def __init__(self, features: int, places: int, sensor: Sensor) -> None:
+        super().__init__()
+        self.constraint = nn.Conv2d(features, 5, 1)
+        nn.init.normal_(self.constraint.weight, 0, 0.02)
+        nn.init.zeros_(self.constraint.bias)  # type: ignore[arg-type]
+        self.log_prior = nn.Parameter(torch.zeros(3))
+        step = math.radians(sensor.field_of_view_deg) / places
+        bearings = math.radians(sensor.first_bin_deg) + step * (torch.arange(places) + 0.5)
+        self.register_buffer("cos", bearings.cos(), persistent=False)
+        self.register_buffer("sin", bearings.sin(), persistent=False)
+        self.register_buffer("units", torch.tensor(UNITS), persistent=False)
+
+    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+        """Motions (N, 3) and their information (N, 3, 3), in ``UNITS``, of features (N, C, 1, places)."""
+        with torch.autocast(features.device.type, enabled=False):
+            radial, tangential, lever, residual, log_weight = (
+                self.constraint(features.float()).squeeze(-2).unbind(1)
+            )
+            weight = log_weight.clamp(*LOG_WEIGHT).exp()
+            rows = torch.stack(
+                [
+                    self.cos * radial - self.sin * tangential,
+                    self.sin * radial + self.cos * tangential,
+                    lever,
+                ],
+                1,
+            )  # (N, 3, places)
+            weighted = rows * weight.unsqueeze(1)
+            matrix = weighted @ rows.transpose(1, 2) + torch.diag(self.log_prior.exp())
+            motion = invert(matrix) @ (weighted @ residual.unsqueeze(-1))
+            return motion.squeeze(-1), matrix
+
+
+def invert(matrix: Tensor) -> Tensor:
+    """The inverse (..., 3, 3) of symmetric positive definite matrices, by Cholesky, written out.
+
+    Exported files have no operator for it.
+    """
+    a, b, c, d, e, f = (matrix[..., i, j] for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)))
+    l11 = a.sqrt()
+    l21, l31 = b / l11, d / l11
+    l22 = (c - l21.square()).clamp(min=1e-12).sqrt()
+    l32 = (e - l31 * l21) / l22
+    l33 = (f - l31.square() - l32.square()).clamp(min=1e-12).sqrt()
+    # The inverse of the factor, below whose diagonal these stand.
+    m11, m22, m33 = 1 / l11, 1 / l22, 1 / l33
+    m21 = -l21 * m11 * m22
+    m32 = -l32 * m22 * m33
+    m31 = -(l31 * m11 + l32 * m21) * m33
+    xx, xy, xh = m11.square() + m21.square() + m31.square(), m21 * m22 + m31 * m32, m31 * m33
+    yy, yh, hh = m22.square() + m32.square(), m32 * m33, m33.square()
+    return torch.stack([xx, xy, xh, xy, yy, yh, xh, yh, hh], -1).unflatten(-1, (3, 3))
+
+
+class ResidualNetwork(TrainedModel):
+    """What measures residual motions: how it is trained, used in a drive, and calibrated.
+
+    A subclass has :meth:`measure` and :meth:`draw`.
+
+    Attributes:
+        scale: (3,) by which its deviations are multiplied, fitted on validation drives; 1 before.
+    """
+
+    only_in_training: ClassVar[tuple[str, ...]] = (
+        "residual",
+        "floor",
+        "passes",
+        "settled",
+        "key_distance",
+        "key_turn_deg",
+    )
+    scale: Tensor
+    units: Tensor
+    warping: Warping
+
+    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
+        super().__init__(options, sensor)
+        self.warping = Warping(**{key: options[key] for key in Warping.__dataclass_fields__})
+        self.drawn = self.warping.drawn(sensor)
+        self.register_buffer("scale", torch.ones(3))
+        self.register_buffer("units", torch.tensor(UNITS), persistent=False)
+
+    @abstractmethod
+    def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
+        """Residual motions of drawn pairs (B, T, 2, bins drawn).
+
+        Returns:
+            The motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the state after them.
+        """
+
+    def forward(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
+        """Residual motions of drawn pairs (B, T, 2, bins drawn), the guess's scan first.
+
+        Returns:
+            Where each later scan was taken, seen from where the guess says (B, T, 3), in metres and radians;
+            covariances (B, T, 3, 3); and the state.
+        """
+        motion, matrix, state = self.measure(pairs, state)
+        units = self.units * self.scale
+        return motion * self.units, invert(matrix) * units * units.unsqueeze(-1), state
+
+    def estimate_scans(self, scans: Tensor) -> Steps:
+        """The steps of encoded scans (N, bins): as in a stream, in full precision."""
+        stepper, values = self.stepper(), scans.cpu().numpy()
+        with torch.autocast(scans.device.type, enabled=False):
+            steps = [stepper(values[frame : frame + 2]) for frame in range(len(values) - 1)]
+        return Steps(
+            np.array([step.array() for step in steps]).reshape(-1, 3),
+            np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
+        )
+
+    def calibrate(self, drives: Sequence[Drive]) -> None:
+        """Fits the scale of the deviations as well: 68.27 % of the errors lie within one of them."""
+        super().calibrate(drives)
+        self.scale.fill_(1.0)
+        estimates = [self.estimate(drive) for drive in drives]
+        errors = np.concatenate(
+            [each.values - drive.steps for each, drive in zip(estimates, drives, strict=True)]
+        )
+        variances = np.concatenate([np.diagonal(each.covariances, axis1=1, axis2=2) for each in estimates])
+        known = np.isfinite(errors).all(1)
+        ratios = np.abs(errors[known]) / np.sqrt(variances[known])
+        self.scale.copy_(torch.from_numpy(np.maximum(np.quantile(ratios, WITHIN, axis=0), 1e-3)))
+
+    def compare_residuals(self, motion: Tensor, matrix: Tensor, truth: Tensor) -> dict[str, Tensor]:
+        """The loss of motions (N, 3) with information (N, 3, 3), in ``UNITS``; truth (N, 3) in metres and
+        radians.
+
+        An error counts by the size of the residual motion, so that small ones are measured finely; below
+        ``floor`` (in ``UNITS``) all count alike.
+        """
+        truth = truth / self.units
+        error = motion - truth
+        relative = error.norm(dim=-1) / (truth.norm(dim=-1) + self.options["floor"])
+        squares = (error.unsqueeze(-2) @ matrix @ error.unsqueeze(-1)).squeeze((-1, -2))
+        likelihood = (squares - torch.logdet(matrix)) / 2
+        return {
+            "loss": relative.mean() + COVARIANCE_PART * likelihood.mean(),
+            "loss_relative": relative.mean(),
+            "loss_likelihood": likelihood.mean(),
+            "diverged": ~error.isfinite().all(-1),
+        }
+
+    def draw_scans(
+        self,
+        earlier: DepthVector,
+        later: DepthVector,
+        guesses: FloatArray,
+        residuals: FloatArray,
+        rng: np.random.Generator,
+        device: torch.device,
+    ) -> tuple[Tensor, Tensor]:
+        """Pairs of scans as the network sees them, half of the windows mirrored where that is exact.
+
+        Args:
+            earlier, later: (..., bins) metres.
+            guesses: (..., 3) where the later scan seems to have been taken, seen from the earlier one.
+            residuals: (..., 3) where it was taken, seen from there.
+            rng: decides which windows, of the first dimension, are mirrored.
+            device: of what is returned.
+
+        Returns:
+            Drawn pairs (..., 2, bins drawn) and residuals (..., 3).
+        """
+        flat, threads = (-1, self.sensor.bins), torch.get_num_threads()
+        viewpoints, here = guesses.reshape(-1, 3), np.zeros((residuals.size // 3, 3))
+        before = render_many(earlier.reshape(flat), self.sensor, viewpoints, self.drawn, threads)
+        now = render_many(later.reshape(flat), self.sensor, here, self.drawn, threads)
+        pairs = np.stack([before, now], 1).reshape(*residuals.shape[:-1], 2, self.drawn.bins)
+        if self.sensor.facing_deg % 180 == 0:  # the mirror image of any other laser is another laser
+            mirrored = rng.random(len(pairs)) < 0.5
+            pairs[mirrored] = pairs[mirrored, ..., ::-1]
+            residuals[mirrored, ..., 1:] *= -1
+        return torch.from_numpy(pairs).to(device), torch.from_numpy(residuals).float().to(device)
+
+    def draw_residual(self, step: FloatArray, rng: np.random.Generator) -> FloatArray:
+        """How far off a guess of a step (3,) is: (3,) in metres and radians."""
+        x, y, heading = np.abs(step)
+        if rng.random() < FROM_REST and max(x, y) < FARTHEST_FROM_REST and heading < SHARPEST_FROM_REST:
+            return step
+        options = ResidualOptions(**self.options["residual"])
+        deviations = np.array([options.x, options.y, math.radians(options.heading_deg)])
+        drawn: FloatArray = (
+            deviations * rng.standard_normal(3) * 10 ** rng.uniform(options.smallest, options.largest)
+        )
+        return drawn
+
+
+def windows_of(batch: Batch) -> tuple[DepthVector, FloatArray]:
+    """Scans (B, T + 1, bins) of a batch of windows, and their poses (B, T + 1, 3) seen from the first."""
+    scans = torch.cat([batch["pairs"][:, :, 0], batch["pairs"][:, -1:, 1]], 1).cpu().numpy()
+    steps = batch["steps"].double().cpu().numpy()
+    return scans, np.stack([poses_to_planar(compose(each)) for each in steps])
+
+
+def seeded_generator() -> np.random.Generator:
+    """Draws what torch's seed says: a training that goes on so draws what it would have drawn."""
+    return np.random.default_rng(int(torch.randint(2**62, ())))
+
+
+class CNNWarp(ResidualNetwork):
+    """The paper's encoder over a pair of drawn scans, and local constraints: no memory of its own."""
+
+    name = "cnn_warp"
+    Options = WarpOptions
+
+    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
+        super().__init__(options, sensor)
+        self.encoder = Encoder(self.drawn, options["kernel_size"], options["pooling"], CHANNELS)
+        self.head = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
+
+    def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
+        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the state."""
+        features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
+        motion, matrix = self.head(features)
+        return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """The error of residual motions by their size, and the likelihood that teaches the covariances."""
+        pairs, residuals = self.draw(batch)
+        motion, matrix, _ = self.measure(pairs.unsqueeze(1))
+        return self.compare_residuals(motion[:, 0], matrix[:, 0], residuals)
+
+    def draw(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """A pair of scans of each window with a guess: drawn pairs (B, 2, bins drawn), residuals (B, 3)."""
+        scans, poses = windows_of(batch)
+        rng = seeded_generator()
+        chosen = np.array([rng.choice(scans.shape[1], 2, replace=False) for _ in scans])
+        earlier, later = (scans[np.arange(len(scans)), which] for which in chosen.T)
+        guesses, residuals = np.empty((2, len(scans), 3))
+        for n, (first, second) in enumerate(chosen):
+            step = relative_step(poses[n, first], poses[n, second])
+            residuals[n] = self.draw_residual(step, rng)
+            guesses[n] = advance(step, relative_step(residuals[n], np.zeros(3)))
+        return self.draw_scans(earlier, later, guesses, residuals, rng, batch["pairs"].device)

@@ -1,0 +1,153 @@
+"""A recurrent network over residual motions: it corrects what one comparison says by those before.
+
+The first stage is :mod:`rcnn_odom.models.cnn_warp`. Its features, its residual motion and how sure it is of
+that go into LSTM layers, whose output corrects the motion and its information (paper III-C2, fig. 2).
+"""
+
+import math
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import advance, relative_step
+from rcnn_odom.models.cnn import Encoder
+from rcnn_odom.models.cnn_warp import (
+    CHANNELS,
+    UNITS,
+    CNNWarp,
+    LocalConstraints,
+    ResidualNetwork,
+    WarpOptions,
+    compare,
+    invert,
+    seeded_generator,
+    windows_of,
+)
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.rcnn import LSTM
+from rcnn_odom.models.trained import Batch, State, TrainedModel
+from rcnn_odom.options import option
+
+POWERS = (-3.0, -1.0)
+"""Powers of ten between which the errors of a window's earlier estimates are scaled in training."""
+
+
+@dataclass(kw_only=True)
+class FirstStageOptions(WarpOptions):
+    """Of the network that is trained first."""
+
+    variant: str = option(choices=(CNNWarp.name,))
+
+
+@dataclass(kw_only=True)
+class RecurrentWarpOptions(WarpOptions):
+    """What ``conf/model`` sets beside the first stage's options."""
+
+    hidden_size: int = option(above=0)
+    layers: int = option(above=0)
+    projection: int = option(above=0)
+    dropout: float = option(least=0, below=1)
+    freeze: bool
+    first_stage: FirstStageOptions
+
+
+class RCNNWarp(ResidualNetwork):
+    """The first stage's features and its residual motion go through an LSTM, which corrects the motion."""
+
+    name = "rcnn_warp"
+    Options = RecurrentWarpOptions
+    first_stage = CNNWarp.name
+    only_in_training: ClassVar[tuple[str, ...]] = (*ResidualNetwork.only_in_training, "dropout", "freeze")
+
+    def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
+        super().__init__(options, sensor)
+        self.encoder = Encoder(self.drawn, options["kernel_size"], options["pooling"], CHANNELS)
+        self.constraints = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
+        for part in (self.encoder, self.constraints):
+            part.requires_grad_(not options["freeze"])
+        self.projection = nn.Linear(self.encoder.features, options["projection"])
+        self.lstm = LSTM(
+            options["projection"] + 6, options["hidden_size"], options["layers"], options["dropout"]
+        )
+        self.correction = nn.Linear(options["hidden_size"], 6)
+        # At first it says what the first stage says.
+        nn.init.zeros_(self.correction.weight)
+        nn.init.zeros_(self.correction.bias)
+
+    def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
+        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the LSTM's state."""
+        features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
+        motion, matrix = self.constraints(features)
+        deviations = invert(matrix).diagonal(dim1=-2, dim2=-1).sqrt()
+        first = torch.cat([torch.asinh(motion / deviations), deviations.log()], -1)
+        inputs = torch.cat([self.projection(features.flatten(1)).float(), first], -1)
+        outputs, state = self.lstm(inputs.unflatten(0, pairs.shape[:-2]), state)
+        with torch.autocast(pairs.device.type, enabled=False):
+            shift, log_share = self.correction(outputs.float().flatten(0, 1)).chunk(2, -1)
+        # Corrections in deviations: what is measured surely is hardly corrected.
+        motion = motion + shift * deviations
+        share = (log_share / 2).exp()
+        matrix = share.unsqueeze(-1) * matrix * share.unsqueeze(-2)
+        return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state
+
+    def initial_state(self) -> dict[str, Tensor]:
+        """Zeros (layers, 1, hidden): the LSTM's hidden and cell state."""
+        shape = len(self.lstm.weight_ih), 1, self.lstm.hidden
+        return {"h": torch.zeros(shape), "c": torch.zeros(shape)}
+
+    def take_first_stage(self, model: TrainedModel) -> None:
+        """Takes encoder and constraints of a trained first stage.
+
+        Raises:
+            InputError: its network is another one.
+        """
+        assert isinstance(model, CNNWarp)
+        for key in ("kernel_size", "pooling", "resolution_deg"):
+            if model.options[key] != self.options[key]:
+                raise InputError(
+                    f"trained with {key}={model.options[key]}, but model.{key} is {self.options[key]}; "
+                    "set it as in that training, or leave model.pretrained out"
+                )
+        self.encoder.load_state_dict(model.encoder.state_dict())
+        self.constraints.load_state_dict(model.head.state_dict())
+
+    def loss(self, batch: Batch) -> dict[str, Tensor]:
+        """As of the first stage, over all scans of the windows."""
+        pairs, residuals = self.draw(batch)
+        motion, matrix, _ = self.measure(pairs)
+        outputs = self.compare_residuals(motion.flatten(0, 1), matrix.flatten(0, 1), residuals.flatten(0, 1))
+        outputs["diverged"] = outputs["diverged"].unflatten(0, motion.shape[:2]).any(1)
+        return outputs
+
+    def draw(self, batch: Batch) -> tuple[Tensor, Tensor]:
+        """Windows as they are in a stream: drawn pairs (B, T, 2, bins drawn), residuals (B, T, 3).
+
+        Each scan's guess is where the last estimated motion leads, and estimates are a little off the truth;
+        key scans change as in a stream.
+        """
+        scans, poses = windows_of(batch)
+        rng = seeded_generator()
+        count, steps = len(scans), scans.shape[1] - 1
+        earlier, guesses, residuals = scans[:, :-1].copy(), *np.empty((2, count, steps, 3))
+        spread = np.array(UNITS)
+        for n in range(count):
+            off = spread * 10 ** rng.uniform(*POWERS) * rng.standard_normal((steps + 1, 3))
+            key, estimate = 0, poses[n, 0]
+            motion = relative_step(poses[n, 0], poses[n, 1]) + self.draw_residual(np.full(3, np.inf), rng)
+            for t in range(1, steps + 1):
+                guess = advance(estimate, motion)
+                earlier[n, t - 1] = scans[n, key]
+                guesses[n, t - 1] = relative_step(poses[n, key], guess)
+                residuals[n, t - 1] = relative_step(guess, poses[n, t])
+                before, estimate = estimate, advance(poses[n, t], off[t])
+                motion = relative_step(before, estimate)
+                x, y, heading = relative_step(poses[n, key], estimate)
+                is_turned = abs(heading) >= math.radians(self.warping.key_turn_deg)
+                if math.hypot(x, y) >= self.warping.key_distance or is_turned:
+                    key, estimate = t, poses[n, t]
+        later = np.ascontiguousarray(scans[:, 1:])
+        return self.draw_scans(earlier, later, guesses, residuals, rng, batch["pairs"].device)

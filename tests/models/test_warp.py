@@ -1,0 +1,367 @@
+"""Networks that measure residual motions, and how they are used in a stream."""
+
+import itertools
+import math
+
+import numpy as np
+import pytest
+import torch
+
+from rcnn_odom.errors import InputError
+from rcnn_odom.geometry import Step, advance, relative_step
+from rcnn_odom.models.cnn_warp import FINE, UNITS, CNNWarp, LocalConstraints, compare, invert
+from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import PairTracker, as_used
+from rcnn_odom.models.rcnn_warp import RCNNWarp
+from rcnn_odom.models.reprojection import render
+from rcnn_odom.models.streaming import Description, Warping
+from rcnn_odom.models.warping import WarpingStepper
+
+SENSOR = Sensor(resolution_deg=1.0)
+RESIDUAL = {"x": 0.2, "y": 0.1, "heading_deg": 2.0, "smallest": -2.0, "largest": 0.3}
+OPTIONS = {
+    "kernel_size": 3,
+    "pooling": "avg",
+    "resolution_deg": 0.5,
+    "passes": 3,
+    "settled": 0.1,
+    "key_distance": 1.0,
+    "key_turn_deg": 20.0,
+    "residual": RESIDUAL,
+    "floor": 0.05,
+    "learning_rate": 1e-3,
+}
+RECURRENT = {"hidden_size": 16, "layers": 2, "projection": 8, "dropout": 0.0, "freeze": True}
+
+
+def room_scan(pose, sensor=SENSOR):
+    """What a laser sees in a room of 12 x 8 m without a corner that looks like another, (bins,)."""
+    x, y, heading = pose
+    angles = np.deg2rad(sensor.first_bin_deg + sensor.resolution_deg * np.arange(sensor.bins)) + heading
+    cos, sin = np.cos(angles), np.sin(angles)
+    with np.errstate(divide="ignore"):
+        walls = [
+            np.where(cos > 0, (7.0 - x) / cos, np.inf),
+            np.where(cos < 0, (-5.0 - x) / cos, np.inf),
+            np.where(sin > 0, (5.0 - y) / sin, np.inf),
+            np.where(sin < 0, (-3.0 - y) / sin, np.inf),
+        ]
+    return np.min(walls, axis=0).astype(np.float32)
+
+
+def drive(count=20, seed=0):
+    """Scans (N, bins) of a walk through the room, and its steps (N-1, 3)."""
+    rng = np.random.default_rng(seed)
+    pose, poses = np.zeros(3), [np.zeros(3)]
+    for _ in range(count - 1):
+        pose = advance(pose, np.array([0.1, 0.02, 0.05]) * rng.normal(1, 0.3, 3))
+        poses.append(pose)
+    steps = [relative_step(one, other) for one, other in itertools.pairwise(poses)]
+    return np.stack([room_scan(each) for each in poses]), np.array(steps)
+
+
+def windows(scans, steps, length):
+    """A batch of all windows of consecutive pairs."""
+    starts = range(len(steps) - length + 1)
+    pairs = [[scans[t : t + 2] for t in range(start, start + length)] for start in starts]
+    return {
+        "pairs": torch.from_numpy(np.array(pairs)),
+        "steps": torch.tensor(np.array([steps[start : start + length] for start in starts])).float(),
+    }
+
+
+class Perfect:
+    """A network that knows where each scan was taken: a search of the pose would find no better."""
+
+    def __init__(self, scans, steps, warping, covariance=None):
+        self.description = Description(SENSOR, warping=warping)
+        self.scans, self.warping, self.calls = scans, warping, 0
+        self.covariance = np.diag([0.01, 0.04, 0.0001]) if covariance is None else covariance
+        self.poses = [np.zeros(3)]
+        for step in steps:
+            self.poses.append(advance(self.poses[-1], step))
+        drawn = self.description.input_sensor
+        self.drawn = [render(scan, SENSOR, np.zeros(3), drawn) for scan in scans]
+        self.guess = None
+
+    def reset(self):
+        self.calls = 0
+
+    def __call__(self, pair):
+        self.calls += 1
+        later = next(n for n, each in enumerate(self.drawn) if np.array_equal(each, pair[1]))
+        # Which viewpoint the earlier scan is seen from: the one that the stepper has drawn last.
+        key, viewpoint = self.seen
+        x, y, heading = relative_step(viewpoint, relative_step(self.poses[key], self.poses[later])).tolist()
+        return Step(x, y, heading, self.covariance)
+
+
+@pytest.fixture
+def perfect(monkeypatch):
+    """Makes a stepper around a perfect network, which is told what the stepper draws."""
+
+    def make(scans, steps, **options):
+        given = {
+            "resolution_deg": 0.5,
+            "passes": 3,
+            "settled": 0.1,
+            "key_distance": 0.3,
+            "key_turn_deg": 20.0,
+        } | options
+        covariance = given.pop("covariance", None)
+        network = Perfect(scans, steps, Warping(**given), covariance)
+
+        def spy(depth, sensor, viewpoint, out):
+            found = [n for n, scan in enumerate(scans) if np.array_equal(scan, depth)]
+            network.seen = found[0], np.array(viewpoint, float)
+            return render(depth, sensor, viewpoint, out)
+
+        monkeypatch.setattr("rcnn_odom.models.warping.render", spy)
+        return WarpingStepper(network)
+
+    return make
+
+
+@pytest.mark.parametrize("key_distance", [0.0, 0.3, 100.0])
+def test_a_perfect_network_gives_the_true_steps_whatever_the_key(perfect, key_distance):
+    scans, steps = drive()
+    stepper = perfect(scans, steps, key_distance=key_distance)
+    got = [stepper(scans[n : n + 2]).array() for n in range(len(steps))]
+    assert np.allclose(got, steps, atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("settled", "passes", "expected"), [(5.0, 6, 1), (1e-6, 6, 2), (0.0, 6, 6), (0.0, 2, 2)]
+)
+def test_a_scan_is_compared_until_a_correction_is_small(perfect, settled, passes, expected):
+    """A perfect network corrects once what its second look finds right."""
+    scans, steps = drive()
+    stepper = perfect(scans, steps, settled=settled, passes=passes)
+    for n in range(4):
+        before = stepper.network.calls
+        stepper(scans[n : n + 2])
+        assert stepper.network.calls - before == expected
+
+
+def test_scans_that_were_left_out_begin_a_new_key(perfect):
+    scans, steps = drive()
+    stepper = perfect(scans, steps, key_distance=100.0)
+    for n in (0, 1, 2, 7, 8):
+        assert np.allclose(stepper(scans[n : n + 2]).array(), steps[n], atol=1e-6)
+
+
+def test_nan_of_the_network_is_no_step_and_forgets_nothing_good(perfect):
+    scans, steps = drive()
+    stepper = perfect(scans, steps)
+    stepper(scans[:2])
+    stepper.network.poses[2] = np.full(3, np.nan)
+    assert np.isnan(stepper(scans[1:3]).array()).all()
+
+
+def test_covariances_are_those_of_two_poses_and_what_comes_back(perfect):
+    scans, steps = drive()
+    own = np.diag([0.01, 0.04, 0.0001])
+    stepper = perfect(scans, steps, key_distance=100.0, settled=0.0, covariance=own)
+    first, second = stepper(scans[:2]), stepper(scans[1:3])
+    # From a key the error is that of one pose, later of two, of which the next step takes one back.
+    turn = np.array(
+        [
+            [math.cos(first.heading), -math.sin(first.heading)],
+            [math.sin(first.heading), math.cos(first.heading)],
+        ]
+    )
+    assert np.allclose(first.covariance[:2, :2], turn @ own[:2, :2] @ turn.T, atol=1e-9)
+    assert np.trace(second.covariance) > 1.9 * np.trace(own)
+    assert np.allclose(second.taken_back, own, atol=1e-9)
+    every = perfect(scans, steps, key_distance=0.0, settled=0.0, covariance=own)
+    assert not every(scans[:2]).taken_back.any()
+
+
+def test_what_is_used_once_is_not_wrapped_again():
+    network = CNNWarp(OPTIONS, SENSOR)
+    stepper = network.stepper()
+    assert as_used(stepper) is stepper
+    assert PairTracker(stepper).description.sensor == SENSOR
+
+
+def test_the_channels_of_an_image():
+    sensor = Sensor(resolution_deg=90.0)
+    before, now = torch.tensor([2.0, 0.0, 4.0, 8.0, 2.0]), torch.tensor([2.0, 3.0, 4.05, 0.0, 2.0])
+    image = compare(torch.stack([before, now])[None], sensor)
+    assert image.shape == (1, 5, 1, 5)
+    difference, depth, slope, sees, both = image[0, :, 0]
+    assert torch.allclose(difference, torch.tensor([0, 0, math.asinh(0.05 / FINE) / 2, 0, 0]), atol=1e-6)
+    assert torch.allclose(depth[:3], torch.log(now[:3] / 10))
+    assert sees.tolist() == [1, 1, 1, 0, 1]
+    assert both.tolist() == [1, 0, 1, 0, 1]
+    across = 2 * math.pi / 2 * 3.0
+    assert slope[1] == pytest.approx(math.asinh((4.05 - 2.0) / across) / 2)
+    assert slope[2] == 0  # beside a bin in which nothing is seen
+
+
+def test_the_inverse_by_cholesky_equals_torchs():
+    torch.manual_seed(0)
+    root = torch.randn(50, 3, 3, dtype=torch.float64)
+    matrices = root @ root.transpose(1, 2) + 0.1 * torch.eye(3)
+    assert torch.allclose(invert(matrices), torch.linalg.inv(matrices), rtol=1e-6)
+
+
+def test_constraints_turn_with_what_is_seen():
+    torch.manual_seed(0)
+    head = LocalConstraints(8, 12, Sensor(resolution_deg=1.0))
+    torch.nn.init.normal_(head.constraint.weight)
+    features = torch.randn(1, 8, 1, 12)
+    motion, matrix = head(features)
+    # The same things, seen a quarter of a turn further to the left.
+    turned, turned_matrix = head(torch.roll(features, 3, -1))
+    quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
+    assert torch.allclose(turned[0], quarter @ motion[0], atol=1e-5)
+    assert torch.allclose(turned_matrix[0], quarter @ matrix[0] @ quarter.T, rtol=1e-4, atol=1e-4)
+
+
+def test_constraints_are_solved_by_least_squares():
+    """Against numpy's solution of the same rows, with the prior as rows of their own."""
+    torch.manual_seed(1)
+    head = LocalConstraints(4, 20, SENSOR)
+    torch.nn.init.normal_(head.constraint.weight)
+    features = torch.randn(1, 4, 1, 20)
+    radial, tangential, lever, residual, log_weight = head.constraint(features)[0, :, 0].detach().double()
+    bearings = np.deg2rad(-180 + 18 * (np.arange(20) + 0.5))
+    cos, sin = np.cos(bearings), np.sin(bearings)
+    rows = np.stack(
+        [
+            cos * radial.numpy() - sin * tangential.numpy(),
+            sin * radial.numpy() + cos * tangential.numpy(),
+            lever.numpy(),
+        ],
+        1,
+    )
+    root = np.exp(log_weight.numpy() / 2)
+    left, right = (
+        np.vstack([rows * root[:, None], np.eye(3)]),
+        np.append(residual.numpy() * root, np.zeros(3)),
+    )
+    expected = np.linalg.lstsq(left, right, rcond=None)[0]
+    motion, matrix = head(features)
+    assert np.allclose(motion[0].detach(), expected, atol=1e-4)
+    assert np.allclose(matrix[0].detach(), left.T @ left, rtol=1e-4, atol=1e-4)
+
+
+def test_what_is_left_of_a_guess_is_exact():
+    """The earlier scan, seen from the guess and then from the residual, is the later one."""
+    scans, steps = drive()
+    network = CNNWarp(OPTIONS | {"resolution_deg": None}, SENSOR)
+    batch = windows(scans, steps, 4)
+    torch.manual_seed(3)
+    pairs, residuals = network.draw(batch)
+    assert pairs.shape == (len(batch["steps"]), 2, SENSOR.bins)
+    for (before, now), residual in zip(pairs.numpy(), residuals.numpy(), strict=True):
+        again = render(before, SENSOR, residual, SENSOR)
+        seen = (again > 0) & (now > 0)
+        assert seen.mean() > 0.9
+        assert np.median(np.abs(again - now)[seen]) < 0.01
+    assert (np.abs(residuals.numpy()).max(0) > 0).all()
+
+
+def test_what_is_drawn_follows_from_torchs_seed():
+    batch = windows(*drive(), 4)
+    network = CNNWarp(OPTIONS, SENSOR)
+    drawn = []
+    for seed in (1, 1, 2):
+        torch.manual_seed(seed)
+        drawn.append(network.draw(batch)[1])
+    assert torch.equal(drawn[0], drawn[1])
+    assert not torch.equal(drawn[0], drawn[2])
+
+
+def train(network, batch, steps):
+    """Fits a network to a batch, drawn anew at every step."""
+    torch.manual_seed(0)
+    optimizer = torch.optim.Adam([p for p in network.parameters() if p.requires_grad])
+    schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, 1e-3, total_steps=steps)
+    for _ in range(steps):
+        optimizer.zero_grad()
+        network.loss(batch)["loss"].backward()
+        torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
+        optimizer.step()
+        schedule.step()
+
+
+@pytest.mark.slow
+def test_it_learns_to_measure_in_a_room_and_knows_how_well():
+    """From standing still, steps of 10 cm and 3 degrees that vary by a third."""
+    torch.manual_seed(0)
+    network = CNNWarp(OPTIONS, SENSOR)
+    train(network, windows(*drive(60), 4), 300)
+    scans, steps = drive(60, seed=5)
+    estimate = network.estimate_scans(torch.from_numpy(scans))
+    errors = np.abs(estimate.values - steps)[3:]
+    assert errors.mean(0) == pytest.approx([0, 0, 0], abs=0.02)
+    deviations = np.sqrt(np.diagonal(estimate.covariances, axis1=1, axis2=2))[3:]
+    assert np.isfinite(deviations).all()
+    assert (deviations < 0.2).all()
+
+
+def test_nothing_seen_keeps_the_guess_and_says_so():
+    network = CNNWarp(OPTIONS, SENSOR)
+    with torch.no_grad():
+        empty = torch.zeros(1, 1, 2, network.drawn.bins)
+        room = torch.from_numpy(room_scan((0, 0, 0), network.drawn)).expand(1, 1, 2, -1)
+        for _ in range(2):
+            steps, blind, _ = network(empty)
+            _, seeing, _ = network(room)
+    assert torch.isfinite(steps).all()
+    assert (blind.diagonal(dim1=-2, dim2=-1) >= seeing.diagonal(dim1=-2, dim2=-1)).all()
+
+
+def test_recurrent_at_first_says_what_its_first_stage_says():
+    first = CNNWarp(OPTIONS, SENSOR)
+    network = RCNNWarp(OPTIONS | RECURRENT, SENSOR)
+    network.take_first_stage(first)
+    pairs = torch.rand(2, 3, 2, first.drawn.bins) * 10
+    with torch.no_grad():
+        expected, got = first(pairs), network(pairs)
+    assert torch.allclose(got[0], expected[0], atol=1e-6)
+    assert torch.allclose(got[1], expected[1], rtol=1e-4)
+    assert [each.shape for each in got[2]] == [(2, 2, 16)] * 2
+
+
+def test_recurrent_windows_are_those_of_a_stream():
+    """Each guess is where the estimates before lead: their residuals are small after the first."""
+    network = RCNNWarp(OPTIONS | RECURRENT | {"resolution_deg": None}, SENSOR)
+    batch = windows(*drive(), 8)
+    torch.manual_seed(0)
+    pairs, residuals = network.draw(batch)
+    assert pairs.shape == (len(batch["steps"]), 8, 2, SENSOR.bins)
+    assert residuals[:, 2:, 0].abs().median() < 0.1
+    for (before, now), residual in zip(pairs[0].numpy(), residuals[0].numpy(), strict=True):
+        again = render(before, SENSOR, residual, SENSOR)
+        seen = (again > 0) & (now > 0)
+        assert np.median(np.abs(again - now)[seen]) < 0.02
+
+
+def test_recurrent_streams_as_it_estimates_windows():
+    network = RCNNWarp(OPTIONS | RECURRENT, SENSOR).eval()
+    torch.nn.init.normal_(network.correction.weight, 0, 0.1)
+    pairs = torch.rand(1, 5, 2, network.drawn.bins) * 10
+    with torch.no_grad():
+        whole, _, _ = network(pairs)
+        state = ()
+        for t in range(5):
+            step, _, state = network(pairs[:, t : t + 1], state)
+            assert torch.allclose(step[:, 0], whole[:, t], atol=1e-5)
+
+
+def test_another_first_stage_is_refused():
+    network = RCNNWarp(OPTIONS | RECURRENT, SENSOR)
+    with pytest.raises(InputError, match=r"kernel_size=5, but model\.kernel_size is 3"):
+        network.take_first_stage(CNNWarp(OPTIONS | {"kernel_size": 5}, SENSOR))
+
+
+def test_the_loss_counts_errors_by_the_size_of_the_motion():
+    network = CNNWarp(OPTIONS, SENSOR)
+    truth = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.0, 0.05]])
+    motion = truth / torch.tensor(UNITS) + torch.tensor([[0.015, 0, 0], [0.0, 0, 0.105]])
+    outputs = network.compare_residuals(motion, torch.eye(3).expand(2, 3, 3), truth)
+    assert outputs["loss_relative"].item() == pytest.approx((0.015 / 0.15 + 0.105 / 1.05) / 2)
+    assert outputs["loss_likelihood"].item() == pytest.approx((0.015**2 + 0.105**2) / 4)
