@@ -2,20 +2,22 @@
 
 import itertools
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
 import torch
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import Step, advance, relative_step
-from rcnn_odom.models.cnn_warp import FINE, UNITS, CNNWarp, LocalConstraints, compare, invert
+from rcnn_odom.geometry import AccumulatedCovariance, Step, advance, relative_step
+from rcnn_odom.models.cnn_warp import FINE, CNNWarp, LocalConstraints, compare, invert, log_determinant
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import PairTracker, as_used
 from rcnn_odom.models.rcnn_warp import RCNNWarp
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.warping import WarpingStepper
+from rcnn_odom.recordings.scan import Scan
 
 SENSOR = Sensor(resolution_deg=1.0)
 RESIDUAL = {"x": 0.2, "y": 0.1, "heading_deg": 2.0, "smallest": -2.0, "largest": 0.3}
@@ -25,6 +27,7 @@ OPTIONS = {
     "resolution_deg": 0.5,
     "passes": 3,
     "settled": 0.1,
+    "radians_a_metre": 0.05,
     "key_distance": 1.0,
     "key_turn_deg": 20.0,
     "residual": RESIDUAL,
@@ -75,7 +78,7 @@ class Perfect:
 
     def __init__(self, scans, steps, warping, covariance=None):
         self.description = Description(SENSOR, warping=warping)
-        self.scans, self.warping, self.calls = scans, warping, 0
+        self.scans, self.warping, self.calls, self.forgotten = scans, warping, 0, 0
         self.covariance = np.diag([0.01, 0.04, 0.0001]) if covariance is None else covariance
         self.poses = [np.zeros(3)]
         for step in steps:
@@ -85,7 +88,10 @@ class Perfect:
         self.guess = None
 
     def reset(self):
-        self.calls = 0
+        self.forgotten = 0
+
+    def forget_last(self):
+        self.forgotten += 1
 
     def __call__(self, pair):
         self.calls += 1
@@ -105,6 +111,7 @@ def perfect(monkeypatch):
             "resolution_deg": 0.5,
             "passes": 3,
             "settled": 0.1,
+            "radians_a_metre": 0.05,
             "key_distance": 0.3,
             "key_turn_deg": 20.0,
         } | options
@@ -141,6 +148,7 @@ def test_a_scan_is_compared_until_a_correction_is_small(perfect, settled, passes
         before = stepper.network.calls
         stepper(scans[n : n + 2])
         assert stepper.network.calls - before == expected
+    assert stepper.network.forgotten == 4 * (expected - 1)
 
 
 def test_scans_that_were_left_out_begin_a_new_key(perfect):
@@ -150,12 +158,47 @@ def test_scans_that_were_left_out_begin_a_new_key(perfect):
         assert np.allclose(stepper(scans[n : n + 2]).array(), steps[n], atol=1e-6)
 
 
-def test_nan_of_the_network_is_no_step_and_forgets_nothing_good(perfect):
+@pytest.mark.parametrize("bad", [np.nan, np.inf])
+def test_nan_of_the_network_is_no_step_and_it_begins_again(perfect, bad):
     scans, steps = drive()
     stepper = perfect(scans, steps)
     stepper(scans[:2])
-    stepper.network.poses[2] = np.full(3, np.nan)
+    poses = stepper.network.poses
+    stepper.network.poses = [*poses[:2], np.full(3, bad), *poses[3:]]
     assert np.isnan(stepper(scans[1:3]).array()).all()
+    assert np.allclose(stepper(scans[3:5]).array(), steps[3], atol=1e-6)
+
+
+def test_a_network_that_jumps_about_has_no_step():
+    """Corrections that never settle tell that it does not know the place; what it says is not handed on."""
+
+    class Jumping(Perfect):
+        def __call__(self, pair):
+            return Step(3.0, 0.0, 0.0, np.eye(3))
+
+    scans, steps = drive()
+    network = Jumping(scans, steps, Warping(0.5, 4, 0.1, 0.05, 0.3, 20.0))
+    assert np.isnan(WarpingStepper(network)(scans[:2]).array()).all()
+
+
+def test_a_held_step_takes_nothing_back():
+    """The variance of a pose after an estimated and a held step is the sum of the two."""
+    own = np.diag([0.01, 0.04, 0.0001])
+
+    class Constant(Perfect):
+        def __call__(self, pair):
+            return Step(0.0, 0.0, 0.0, own)
+
+    network = Constant(*drive(5), Warping(0.5, 1, 0.1, 0.05, 100.0, 20.0))
+    network.description = replace(network.description, typical_step=(0.3, 0.1, 0.05))
+    tracker = PairTracker(network)
+    bearings = np.deg2rad(SENSOR.first_bin_deg + np.arange(360.0))
+    seen, empty = Scan(np.full(360, 5.0), bearings), Scan(np.full(360, np.inf), bearings)
+    tracker.begin(seen)
+    added = AccumulatedCovariance()
+    for scan in (seen, empty):
+        added.add(np.zeros(3), tracker.register(scan).step)
+    assert np.allclose(np.diag(added.value), np.diag(own) + np.square([0.3, 0.1, 0.05]))
 
 
 def test_covariances_are_those_of_two_poses_and_what_comes_back(perfect):
@@ -206,9 +249,24 @@ def test_the_inverse_by_cholesky_equals_torchs():
     assert torch.allclose(invert(matrices), torch.linalg.inv(matrices), rtol=1e-6)
 
 
+def test_places_look_where_their_features_come_from():
+    """What moves a place's features most lies in the middle of what it sees."""
+    network = CNNWarp(OPTIONS | {"resolution_deg": 0.2}, Sensor())
+    for weight in network.encoder.parameters():
+        torch.nn.init.constant_(weight, 0.1 if weight.ndim > 1 else 1.0)
+    image = torch.ones(1, 5, 1, 1801, requires_grad=True)
+    features = network.encoder.convolve(image)
+    assert features.shape[-1] == len(network.encoder.places)
+    for place in (5, 30):
+        (sensitivity,) = torch.autograd.grad(features[..., place].sum(), image, retain_graph=True)
+        weights = sensitivity.sum((0, 1, 2)).numpy()
+        middle = (weights * np.arange(1801)).sum() / weights.sum()
+        assert network.encoder.places[place] == pytest.approx(middle, abs=0.01)
+
+
 def test_constraints_turn_with_what_is_seen():
     torch.manual_seed(0)
-    head = LocalConstraints(8, 12, Sensor(resolution_deg=1.0))
+    head = LocalConstraints(8, 30.0 * np.arange(12), Sensor(resolution_deg=1.0))
     torch.nn.init.normal_(head.constraint.weight)
     features = torch.randn(1, 8, 1, 12)
     motion, matrix = head(features)
@@ -222,11 +280,11 @@ def test_constraints_turn_with_what_is_seen():
 def test_constraints_are_solved_by_least_squares():
     """Against numpy's solution of the same rows, with the prior as rows of their own."""
     torch.manual_seed(1)
-    head = LocalConstraints(4, 20, SENSOR)
+    head = LocalConstraints(4, 18.0 * np.arange(20), SENSOR)
     torch.nn.init.normal_(head.constraint.weight)
     features = torch.randn(1, 4, 1, 20)
     radial, tangential, lever, residual, log_weight = head.constraint(features)[0, :, 0].detach().double()
-    bearings = np.deg2rad(-180 + 18 * (np.arange(20) + 0.5))
+    bearings = np.deg2rad(-180 + 18 * np.arange(20))
     cos, sin = np.cos(bearings), np.sin(bearings)
     rows = np.stack(
         [
@@ -358,10 +416,25 @@ def test_another_first_stage_is_refused():
         network.take_first_stage(CNNWarp(OPTIONS | {"kernel_size": 5}, SENSOR))
 
 
+def test_pairs_that_do_not_share_their_scans_are_refused():
+    batch = windows(*drive(), 3)
+    batch["pairs"][:, 0, 1] += 0.1
+    with pytest.raises(InputError, match="max_turn_deg"):
+        CNNWarp(OPTIONS, SENSOR).loss(batch)
+
+
+def test_the_factor_of_a_sharply_seen_corridor_is_finite():
+    rows = torch.tensor([0.6, 0.8, 0.3]).expand(64, 113, 3) + 1e-4 * torch.randn(64, 113, 3)
+    matrices = 3e3 * rows.transpose(1, 2) @ rows + 0.02 * torch.eye(3)
+    assert torch.isfinite(log_determinant(matrices)).all()
+    variances = invert(matrices).diagonal(dim1=-2, dim2=-1)
+    assert ((variances > 0) & (variances < 100)).all()
+
+
 def test_the_loss_counts_errors_by_the_size_of_the_motion():
     network = CNNWarp(OPTIONS, SENSOR)
     truth = torch.tensor([[0.1, 0.0, 0.0], [0.0, 0.0, 0.05]])
-    motion = truth / torch.tensor(UNITS) + torch.tensor([[0.015, 0, 0], [0.0, 0, 0.105]])
+    motion = truth / network.units + torch.tensor([[0.015, 0, 0], [0.0, 0, 0.105]])
     outputs = network.compare_residuals(motion, torch.eye(3).expand(2, 3, 3), truth)
     assert outputs["loss_relative"].item() == pytest.approx((0.015 / 0.15 + 0.105 / 1.05) / 2)
     assert outputs["loss_likelihood"].item() == pytest.approx((0.015**2 + 0.105**2) / 4)

@@ -69,11 +69,13 @@ def save_at_every_step(monkeypatch):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("variant", ["cnn_cls", "rcnn_reg"])
+@pytest.mark.parametrize(
+    ("variant", "averaging"), [("cnn_cls", "0.0"), ("cnn_cls", "0.6"), ("rcnn_reg", "0.0")]
+)
 def test_killed_after_any_step_it_goes_on_bit_for_bit(
-    configure, kitti, tmp_path, monkeypatch, caplog, save_at_every_step, variant
+    configure, kitti, tmp_path, monkeypatch, caplog, save_at_every_step, variant, averaging
 ):
-    options = [f"model={variant}", *kitti, *VARIED]
+    options = [f"model={variant}", *kitti, *VARIED, f"model.averaging={averaging}"]
     if variant == "rcnn_reg":  # the first stage is the other variant's test
         train(configure("model=cnn_cls", *kitti, run="cnn"))
         options += [f"model.pretrained={tmp_path}/outputs/cnn/{BEST}", "model.batch_size=2", "model.stride=6"]

@@ -92,7 +92,9 @@ class Encoder(nn.Module):
         inputs: channels of an image; 2: the two scans.
 
     Attributes:
-        channels, places, features: of the output, and the product of the two.
+        channels: of the output.
+        places: bins, with fractions, in whose middle each place of the output looks, (places,).
+        features: channels times places.
 
     Raises:
         InputError: there are too few bins for six layers.
@@ -111,25 +113,28 @@ class Encoder(nn.Module):
             raise ValueError(f"kernel_size must be odd, not {kernel_size}: padding could not keep the length")
         layers: list[nn.Module] = []
         length = sensor.bins
+        first, spacing = 0.0, 1  # of the places, in bins
         for number, (channels, stride) in enumerate(zip(CHANNELS, STRIDES, strict=True)):
             if number in (2, 4):
                 pool = {"avg": nn.AvgPool2d, "max": nn.MaxPool2d}[pooling]
                 layers.append(pool((1, 2)))
                 length //= 2
+                first, spacing = first + spacing / 2, 2 * spacing
             convolution = nn.Conv2d(
                 inputs, channels, (1, kernel_size), stride=(1, stride), padding=(0, kernel_size // 2)
             )
             nn.init.kaiming_normal_(convolution.weight, nonlinearity="relu")
             nn.init.zeros_(convolution.bias)  # type: ignore[arg-type]
             layers += [convolution, nn.ReLU(inplace=True)]
-            length, inputs = (length - 1) // stride + 1, channels
+            length, inputs, spacing = (length - 1) // stride + 1, channels, spacing * stride
         if length < 1:
             raise InputError(
                 f"data.sensor has {sensor.bins} bins, too few for the network; six layers leave none"
             )
         self.layers = nn.Sequential(*layers)
         self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
-        self.max_range, self.channels, self.places = sensor.max_range, inputs, length
+        self.max_range, self.channels = sensor.max_range, inputs
+        self.places = first + spacing * np.arange(length, dtype=np.float64)
         self.features = inputs * length
 
     def forward(self, pairs: Tensor) -> Tensor:

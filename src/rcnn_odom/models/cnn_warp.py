@@ -19,7 +19,9 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn import functional
 
+from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray, Steps, advance, compose, poses_to_planar, relative_step
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.encoding import Sensor
@@ -27,20 +29,19 @@ from rcnn_odom.models.reprojection import DepthVector, render_many
 from rcnn_odom.models.streaming import Warping
 from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
 from rcnn_odom.models.uncertainty import WITHIN
-from rcnn_odom.models.warping import RADIANS_A_METRE
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
 CHANNELS = 5
 """Of an image of two scans: see :func:`compare`."""
-UNITS = (1.0, 1.0, RADIANS_A_METRE)
-"""Metres, metres and radians: what the head solves for, and the loss compares, so that all count alike."""
 FINE = 0.05
 """Metres from which on a difference of ranges counts by its logarithm."""
 NEAR = 10.0
 """Metres: the middle of the ranges, of which the logarithm is taken."""
-LOG_WEIGHT = (-12.0, 8.0)
-"""Bounds of the logarithm of a place's weight."""
+LOG_WEIGHT, LEAST_LOG_PRIOR = (-12.0, 8.0), -4.0
+"""Bounds of the logarithm of a place's weight, and of that of the prior's: fp32 cannot solve for more."""
+ROUNDING = 1e-6
+"""Of fp32, relative to an entry of a matrix."""
 COVARIANCE_PART = 0.05
 """Of the loss, of the likelihood by which the covariances are learned."""
 FROM_REST = 0.1
@@ -75,6 +76,7 @@ class WarpOptions(Recipe):
     resolution_deg: float | None = option(above=0)
     passes: int = option(above=0)
     settled: float = option(least=0)
+    radians_a_metre: float = option(above=0)
     key_distance: float = option(least=0)
     key_turn_deg: float = option(above=0)
     residual: ResidualOptions
@@ -98,9 +100,11 @@ def compare(pairs: Tensor, sensor: Sensor) -> Tensor:
     zero = now.new_zeros(())
     difference = torch.where(both, torch.asinh((now - before) / FINE), zero) / 2
     depth = torch.where(sees, torch.log(now.clamp(min=0.1) / NEAR), zero)
-    left, right = torch.roll(now, -1, -1), torch.roll(now, 1, -1)
-    across = 2 * math.radians(sensor.resolution_deg) * now.clamp(min=0.1)
-    slope = torch.where(sees & (left > 0) & (right > 0), torch.asinh((left - right) / across), zero) / 2
+    right, middle, left = now[..., :-2], now[..., 1:-1], now[..., 2:]
+    across = 2 * math.radians(sensor.resolution_deg) * middle.clamp(min=0.1)
+    is_surface = (left > 0) & (middle > 0) & (right > 0)
+    slope = torch.where(is_surface, torch.asinh((left - right) / across), zero) / 2
+    slope = functional.pad(slope, (1, 1))  # the ends have one neighbour alone
     image = torch.stack([difference, depth, slope, sees.to(now.dtype), both.to(now.dtype)], -1)
     return image.unsqueeze(1).permute(0, 3, 1, 2)  # channels innermost in memory, as the encoder wants them
 
@@ -116,28 +120,25 @@ class LocalConstraints(nn.Module):
 
     Args:
         features: channels of the encoder's output.
-        places: how many the encoder's output has.
-        sensor: the bins drawn, around which the places are spread.
+        places: bins, with fractions, in whose middle each place of the encoder's output looks, (places,).
+        sensor: the bins drawn.
     """
 
     cos: Tensor
     sin: Tensor
-    units: Tensor
 
-    def __init__(self, features: int, places: int, sensor: Sensor) -> None:
+    def __init__(self, features: int, places: FloatArray, sensor: Sensor) -> None:
         super().__init__()
         self.constraint = nn.Conv2d(features, 5, 1)
         nn.init.normal_(self.constraint.weight, 0, 0.02)
         nn.init.zeros_(self.constraint.bias)  # type: ignore[arg-type]
         self.log_prior = nn.Parameter(torch.zeros(3))
-        step = math.radians(sensor.field_of_view_deg) / places
-        bearings = math.radians(sensor.first_bin_deg) + step * (torch.arange(places) + 0.5)
-        self.register_buffer("cos", bearings.cos(), persistent=False)
-        self.register_buffer("sin", bearings.sin(), persistent=False)
-        self.register_buffer("units", torch.tensor(UNITS), persistent=False)
+        bearings = np.deg2rad(sensor.first_bin_deg + sensor.resolution_deg * places)
+        self.register_buffer("cos", torch.from_numpy(np.cos(bearings)).float(), persistent=False)
+        self.register_buffer("sin", torch.from_numpy(np.sin(bearings)).float(), persistent=False)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Motions (N, 3) and their information (N, 3, 3), in ``UNITS``, of features (N, C, 1, places)."""
+        """Motions (N, 3) and their information (N, 3, 3), in ``units``, of features (N, C, 1, places)."""
         with torch.autocast(features.device.type, enabled=False):
             radial, tangential, lever, residual, log_weight = (
                 self.constraint(features.float()).squeeze(-2).unbind(1)
@@ -152,22 +153,33 @@ class LocalConstraints(nn.Module):
                 1,
             )  # (N, 3, places)
             weighted = rows * weight.unsqueeze(1)
-            matrix = weighted @ rows.transpose(1, 2) + torch.diag(self.log_prior.exp())
+            matrix = weighted @ rows.transpose(1, 2) + torch.diag(
+                self.log_prior.clamp(min=LEAST_LOG_PRIOR).exp()
+            )
             motion = invert(matrix) @ (weighted @ residual.unsqueeze(-1))
             return motion.squeeze(-1), matrix
 
 
-def invert(matrix: Tensor) -> Tensor:
-    """The inverse (..., 3, 3) of symmetric positive definite matrices, by Cholesky, written out.
+def factor(matrix: Tensor) -> tuple[Tensor, ...]:
+    """The Cholesky factor of symmetric positive definite matrices (..., 3, 3), written out.
 
-    Exported files have no operator for it.
+    Returns:
+        Its elements (...) l11, l21, l22, l31, l32 and l33.
+
+    Exported files have no operator for it. What rounding would make negative stays a millionth of its entry.
     """
     a, b, c, d, e, f = (matrix[..., i, j] for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)))
     l11 = a.sqrt()
     l21, l31 = b / l11, d / l11
-    l22 = (c - l21.square()).clamp(min=1e-12).sqrt()
+    l22 = torch.maximum(c - l21.square(), ROUNDING * c).sqrt()
     l32 = (e - l31 * l21) / l22
-    l33 = (f - l31.square() - l32.square()).clamp(min=1e-12).sqrt()
+    l33 = torch.maximum(f - l31.square() - l32.square(), ROUNDING * f).sqrt()
+    return l11, l21, l22, l31, l32, l33
+
+
+def invert(matrix: Tensor) -> Tensor:
+    """The inverse (..., 3, 3) of symmetric positive definite matrices."""
+    l11, l21, l22, l31, l32, l33 = factor(matrix)
     # The inverse of the factor, below whose diagonal these stand.
     m11, m22, m33 = 1 / l11, 1 / l22, 1 / l33
     m21 = -l21 * m11 * m22
@@ -178,12 +190,20 @@ def invert(matrix: Tensor) -> Tensor:
     return torch.stack([xx, xy, xh, xy, yy, yh, xh, yh, hh], -1).unflatten(-1, (3, 3))
 
 
+def log_determinant(matrix: Tensor) -> Tensor:
+    """The logarithm of the determinant (...) of symmetric positive definite matrices (..., 3, 3)."""
+    l11, _, l22, _, _, l33 = factor(matrix)
+    return 2 * (l11.log() + l22.log() + l33.log())
+
+
 class ResidualNetwork(TrainedModel):
     """What measures residual motions: how it is trained, used in a drive, and calibrated.
 
     A subclass has :meth:`measure` and :meth:`draw`.
 
     Attributes:
+        units: (3,) metres, metres and radians in which the head solves and the loss compares, so that all
+            three count alike.
         scale: (3,) by which its deviations are multiplied, fitted on validation drives; 1 before.
     """
 
@@ -204,14 +224,14 @@ class ResidualNetwork(TrainedModel):
         self.warping = Warping(**{key: options[key] for key in Warping.__dataclass_fields__})
         self.drawn = self.warping.drawn(sensor)
         self.register_buffer("scale", torch.ones(3))
-        self.register_buffer("units", torch.tensor(UNITS), persistent=False)
+        self.register_buffer("units", torch.tensor([1.0, 1.0, options["radians_a_metre"]]), persistent=False)
 
     @abstractmethod
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
         """Residual motions of drawn pairs (B, T, 2, bins drawn).
 
         Returns:
-            The motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the state after them.
+            The motions (B, T, 3) and their information (B, T, 3, 3), in ``units``, and the state after them.
         """
 
     def forward(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
@@ -244,22 +264,25 @@ class ResidualNetwork(TrainedModel):
             [each.values - drive.steps for each, drive in zip(estimates, drives, strict=True)]
         )
         variances = np.concatenate([np.diagonal(each.covariances, axis1=1, axis2=2) for each in estimates])
-        known = np.isfinite(errors).all(1)
+        known = np.isfinite(errors).all(1) & np.isfinite(variances).all(1)
+        if not known.any():
+            return
         ratios = np.abs(errors[known]) / np.sqrt(variances[known])
         self.scale.copy_(torch.from_numpy(np.maximum(np.quantile(ratios, WITHIN, axis=0), 1e-3)))
 
     def compare_residuals(self, motion: Tensor, matrix: Tensor, truth: Tensor) -> dict[str, Tensor]:
-        """The loss of motions (N, 3) with information (N, 3, 3), in ``UNITS``; truth (N, 3) in metres and
+        """The loss of motions (N, 3) with information (N, 3, 3), in ``units``; truth (N, 3) in metres and
         radians.
 
         An error counts by the size of the residual motion, so that small ones are measured finely; below
-        ``floor`` (in ``UNITS``) all count alike.
+        ``floor`` (in ``units``) all count alike.
         """
         truth = truth / self.units
         error = motion - truth
         relative = error.norm(dim=-1) / (truth.norm(dim=-1) + self.options["floor"])
-        squares = (error.unsqueeze(-2) @ matrix @ error.unsqueeze(-1)).squeeze((-1, -2))
-        likelihood = (squares - torch.logdet(matrix)) / 2
+        # Not as a product of matrices, which autocast would round to bf16.
+        squares = (error.unsqueeze(-1) * matrix * error.unsqueeze(-2)).sum((-1, -2))
+        likelihood = (squares - log_determinant(matrix)) / 2
         return {
             "loss": relative.mean() + COVARIANCE_PART * likelihood.mean(),
             "loss_relative": relative.mean(),
@@ -313,7 +336,16 @@ class ResidualNetwork(TrainedModel):
 
 
 def windows_of(batch: Batch) -> tuple[DepthVector, FloatArray]:
-    """Scans (B, T + 1, bins) of a batch of windows, and their poses (B, T + 1, 3) seen from the first."""
+    """Scans (B, T + 1, bins) of a batch of windows, and their poses (B, T + 1, 3) seen from the first.
+
+    Raises:
+        InputError: the pairs of a window do not share their scans.
+    """
+    if not torch.equal(batch["pairs"][:, 1:, 0], batch["pairs"][:, :-1, 1]):
+        raise InputError(
+            "data.augment.max_turn_deg: turns the second scan of each pair by itself; networks that draw "
+            "their own guesses have no use for it; leave it out"
+        )
     scans = torch.cat([batch["pairs"][:, :, 0], batch["pairs"][:, -1:, 1]], 1).cpu().numpy()
     steps = batch["steps"].double().cpu().numpy()
     return scans, np.stack([poses_to_planar(compose(each)) for each in steps])
@@ -336,7 +368,7 @@ class CNNWarp(ResidualNetwork):
         self.head = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
 
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the state."""
+        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``units``, and the state."""
         features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
         motion, matrix = self.head(features)
         return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state

@@ -58,9 +58,15 @@ class OnnxStepper:
         """Forgets all earlier pairs."""
         # An array of its own for h and for c: one for both would make them one state.
         self._state = {name: zeros.copy() for name, zeros in self._initial.items()}
+        self._before = self._state
+
+    def forget_last(self) -> None:
+        """Forgets the last pair: the next one is compared in its place."""
+        self._state = self._before
 
     def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
         """The step between two encoded scans (2, bins), the earlier first."""
+        self._before = self._state
         step, covariance, *state = self._session.run(self._outputs, {"scans": pair[None], **self._state})
         self._state = dict(zip(self._state, state, strict=True))
         x, y, heading = step[0].tolist()

@@ -1,13 +1,14 @@
 """Models that look at pairs of encoded scans, in a stream of whole scans."""
 
 import math
+from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.geometry import FloatArray, Step, advance
+from rcnn_odom.geometry import FloatArray, Step, advance, relative_covariance
 from rcnn_odom.models.encoding import decode
-from rcnn_odom.models.streaming import Registered, Stepper
+from rcnn_odom.models.streaming import Network, Registered, Stepper
 from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.recordings.scan import Scan
 
@@ -25,7 +26,7 @@ def as_used(network: Stepper) -> Stepper:
         return network
     from rcnn_odom.models.warping import WarpingStepper  # compiled code, which other networks do not need
 
-    return network if isinstance(network, WarpingStepper) else WarpingStepper(network)
+    return network if isinstance(network, WarpingStepper) else WarpingStepper(cast(Network, network))
 
 
 class PairTracker:
@@ -67,6 +68,7 @@ class PairTracker:
         self._earlier: npt.NDArray[np.float32] | None = None  # the last scan with returns
         self._present: npt.NDArray[np.float32] | None = None  # the last scan
         self._motion, self._held, self._missed = np.zeros(3), 0, 0
+        self._open = np.zeros((3, 3))  # of the last step's error, what the next estimate would take back
         self._beams, self._spacing = 0, 0.0
         # Surfaces are drawn alike whatever the beams: they may be fewer than the sensor's, on a part of it.
         self.beam_check = BeamCheck(self.description.sensor, partly=self.description.warping is not None)
@@ -107,7 +109,7 @@ class PairTracker:
         if not np.isfinite(step.array()).all():
             self._stepper.reset()  # its state is nan as well
             return self._hold(periods, [*notes, "no estimate: the last motion goes on"])
-        self._motion, self._held = step.array(), 0
+        self._motion, self._held, self._open = step.array(), 0, step.taken_back
         return Registered(step, tuple(notes))
 
     def _encode(self, scan: Scan, notes: list[str]) -> npt.NDArray[np.float32]:
@@ -152,4 +154,7 @@ class PairTracker:
         # What is unknown of one is unknown of its covariances with the others.
         covariance = np.diag(np.square(typical)) + 0 * np.outer(typical, typical)
         x, y, heading = held.tolist()
-        return Registered(Step(x, y, heading, covariance), tuple(notes), is_estimated=False)
+        # It takes nothing back of the last step's error, which whoever adds up covariances takes off.
+        stays = relative_covariance(Step(x, y, heading), 2 * self._open, np.zeros((3, 3)))
+        self._open = np.zeros((3, 3))
+        return Registered(Step(x, y, heading, covariance + stays), tuple(notes), is_estimated=False)

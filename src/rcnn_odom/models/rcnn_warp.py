@@ -17,7 +17,6 @@ from rcnn_odom.geometry import advance, relative_step
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.cnn_warp import (
     CHANNELS,
-    UNITS,
     CNNWarp,
     LocalConstraints,
     ResidualNetwork,
@@ -79,7 +78,7 @@ class RCNNWarp(ResidualNetwork):
         nn.init.zeros_(self.correction.bias)
 
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``UNITS``, and the LSTM's state."""
+        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``units``, and the LSTM's state."""
         features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
         motion, matrix = self.constraints(features)
         deviations = invert(matrix).diagonal(dim1=-2, dim2=-1).sqrt()
@@ -133,7 +132,7 @@ class RCNNWarp(ResidualNetwork):
         rng = seeded_generator()
         count, steps = len(scans), scans.shape[1] - 1
         earlier, guesses, residuals = scans[:, :-1].copy(), *np.empty((2, count, steps, 3))
-        spread = np.array(UNITS)
+        spread = self.units.double().cpu().numpy()
         for n in range(count):
             off = spread * 10 ** rng.uniform(*POWERS) * rng.standard_normal((steps + 1, 3))
             key, estimate = 0, poses[n, 0]

@@ -242,7 +242,7 @@ def _largest_gap(at, step):  # type: ignore[no-untyped-def]
     while 2 * below < len(at) - 1 and bins < 63:
         bins += 1
         below += counts[bins]
-    return max(1.01 * bins * step, min(GAP_SPACINGS * bins * step, LARGEST_GAP))
+    return max(1.01 * step, min(GAP_SPACINGS * bins * step, LARGEST_GAP))
 
 
 @compiled

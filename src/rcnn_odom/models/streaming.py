@@ -19,8 +19,8 @@ class Warping:
         resolution_deg: width of the bins that scans are drawn into; None: that of the sensor.
         passes: how often each scan is compared at most, each time with the earlier scan seen from the last
             estimate.
-        settled: metres; a scan is not compared again after a correction of less than that, or of as many
-            times 0.05 radians.
+        settled: metres; a scan is not compared again after a correction of less than that.
+        radians_a_metre: an error of the heading that counts like a metre: one over a usual range in metres.
         key_distance, key_turn_deg: metres and degrees from the key scan, with which all scans are compared,
             from which on the present scan takes its place. 0: every scan, so that each is compared with the
             one before.
@@ -29,6 +29,7 @@ class Warping:
     resolution_deg: float | None
     passes: int
     settled: float
+    radians_a_metre: float
     key_distance: float
     key_turn_deg: float
 
@@ -72,6 +73,13 @@ class Stepper(Protocol):
 
     def reset(self) -> None:
         """Forgets all earlier pairs."""
+
+
+class Network(Stepper, Protocol):
+    """What a network with a :class:`Warping` is beside that."""
+
+    def forget_last(self) -> None:
+        """Forgets the last pair: the next one is compared in its place."""
 
 
 @dataclass(frozen=True, eq=False)

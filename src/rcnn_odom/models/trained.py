@@ -40,6 +40,8 @@ class Recipe:
         repeat: how often each window comes in an epoch, each time augmented in another way.
         pretrained: checkpoint whose weights training begins with, of the same model or of its first stage;
             None: random weights, and a first stage that is found or trained.
+        averaging: decay of the moving average of the weights over the steps, which is validated and kept in
+            their place; 0: the weights themselves.
     """
 
     epochs: int = option(above=0)
@@ -49,6 +51,7 @@ class Recipe:
     stride: int | None = option(default=None, above=0)
     repeat: int = option(default=1, above=0)
     pretrained: str | None = None
+    averaging: float = option(default=0.0, least=0, below=1)
 
 
 def chunks_of_pairs(scans: Tensor) -> Iterator[Tensor]:
@@ -202,10 +205,17 @@ class TorchStepper:
     def reset(self) -> None:
         """Forgets all earlier pairs."""
         self._state: State = ()
+        self._before: State = ()
+
+    def forget_last(self) -> None:
+        """Forgets the last pair: the next one is compared in its place."""
+        self._state = self._before
 
     @torch.no_grad()
     def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
         """The step between two encoded scans (2, bins), the earlier first."""
-        steps, spread, self._state = self.model(torch.from_numpy(pair)[None, None], self._state)
+        self._before = self._state
+        pairs = torch.from_numpy(pair)[None, None].to(self.model.typical_step.device)
+        steps, spread, self._state = self.model(pairs, self._state)
         x, y, heading = steps.flatten().double().tolist()
-        return Step(x, y, heading, spread[0, 0].double().numpy())
+        return Step(x, y, heading, spread[0, 0].double().cpu().numpy())

@@ -18,10 +18,10 @@ from rcnn_odom.geometry import (
     turn_covariance,
 )
 from rcnn_odom.models.reprojection import render
-from rcnn_odom.models.streaming import Stepper
+from rcnn_odom.models.streaming import Network
 
-RADIANS_A_METRE = 0.05
-"""An error of the heading of so much is a metre at a distance of 20 m."""
+LOST = 5.0
+"""Times ``settled``: where the last of several corrections is larger, the network does not know the place."""
 
 
 class WarpingStepper:
@@ -35,7 +35,7 @@ class WarpingStepper:
             earlier one seems to have been taken; its description says how it is used.
     """
 
-    def __init__(self, network: Stepper) -> None:
+    def __init__(self, network: Network) -> None:
         assert network.description.warping is not None
         self.network, self.description = network, network.description
         self.warping, self._drawn = network.description.warping, network.description.input_sensor
@@ -51,9 +51,11 @@ class WarpingStepper:
         """The step between two encoded scans (2, bins), the earlier first."""
         if self._last is None or not np.array_equal(pair[0], self._last):
             self._take_key(pair[0])  # the first pair, or scans between were not for the network
-        step, pose, covariance = self._measure(pair[1])
-        if not np.isfinite(pose).all():
+        measured = self._measure(pair[1])
+        if measured is None:
+            self.reset()
             return Step(math.nan, math.nan, math.nan)
+        step, pose, covariance = measured
         is_key = self._is_far(pose)
         if is_key:
             self._take_key(pair[1])
@@ -73,17 +75,26 @@ class WarpingStepper:
         is_turned = abs(heading) >= math.radians(self.warping.key_turn_deg)
         return math.hypot(x, y) >= self.warping.key_distance or is_turned
 
-    def _measure(self, scan: npt.NDArray[np.float32]) -> tuple[Step, FloatArray, FloatArray]:
-        """The step to a scan; its pose (3,) in the frame of the key, and covariance (3, 3) in its own."""
+    def _measure(self, scan: npt.NDArray[np.float32]) -> tuple[Step, FloatArray, FloatArray] | None:
+        """The step to a scan; its pose (3,) in the frame of the key, and covariance (3, 3) in its own.
+
+        None where the network finds no place for it.
+        """
         now = render(scan, self.description.sensor, np.zeros(3), self._drawn)
         pose = advance(self._pose, self._motion)
-        for _ in range(self.warping.passes):
+        for number in range(self.warping.passes):
+            if number:
+                self.network.forget_last()  # of several passes the last one is the scan's
             before = render(self._key, self.description.sensor, pose, self._drawn)
             residual = self.network(np.stack([before, now]))
+            correction = math.hypot(residual.x, residual.y, residual.heading / self.warping.radians_a_metre)
+            if not math.isfinite(correction):
+                return None
             pose = advance(pose, residual.array())
-            turn = residual.heading / RADIANS_A_METRE
-            if math.hypot(residual.x, residual.y, turn) < self.warping.settled:
+            if correction < self.warping.settled:
                 break
+        if number and correction > LOST * self.warping.settled > 0:
+            return None  # it jumps about
         covariance = turn_covariance(residual.covariance, -residual.heading)
         x, y, heading = relative_step(self._pose, pose).tolist()
         step = Step(x, y, heading)

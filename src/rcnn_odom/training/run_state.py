@@ -43,7 +43,7 @@ DECIDING = (
     *("training/modules.py", "training/datamodule.py", "training/windows.py", "training/augmentation.py"),
     "training/fresh_worlds.py",
     *("training/stages.py", "training/checkpoint.py", "training/saving.py", "training/machine.py"),
-    *("training/pretrained.py", "training/matcher_truth.py"),
+    *("training/pretrained.py", "training/matcher_truth.py", "training/averaging.py"),
     *("evaluation/drift.py", "evaluation/drift_metric.py"),
 )
 """Sources that decide what a training gives."""
@@ -61,8 +61,16 @@ ELSEWHERE = {"run_dir": None, "outputs": None}
 
 def _deciding(settings: Settings) -> Settings:
     """The settings that say what a run is, whatever time it was given."""
-    trainer = settings["trainer"]
-    return settings | ELSEWHERE | {"trainer": trainer | dict.fromkeys(WITHOUT_EFFECT)}
+    trainer, model = settings["trainer"], _drop_unused(settings["model"])
+    return settings | ELSEWHERE | {"trainer": trainer | dict.fromkeys(WITHOUT_EFFECT), "model": model}
+
+
+def _drop_unused(model: Settings) -> Settings:
+    """The options of a model without averaging where it is off, as in runs of versions that had none."""
+    kept = {name: value for name, value in model.items() if name != "averaging" or value}
+    if isinstance(model.get("first_stage"), dict):
+        kept["first_stage"] = _drop_unused(model["first_stage"])
+    return kept
 
 
 class State(Enum):
@@ -254,7 +262,7 @@ def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -
         data["fresh_worlds"] = settings["data"]["reader"]
     trainer = {name: value for name, value in settings["trainer"].items() if name not in WITHOUT_EFFECT}
     precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
-    model = _name_weights(settings["model"])
+    model = _name_weights(_drop_unused(settings["model"]))
     parts = [recordings, data, model, trainer | {"precision": precision}, settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 

@@ -28,6 +28,7 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.formats import open_recording
 from rcnn_odom.recordings.reference import MATCHER
 from rcnn_odom.recordings.trajectory import flatten
+from rcnn_odom.training.averaging import Averaging
 from rcnn_odom.training.checkpoint import calibrate, load_module, read_checkpoint
 from rcnn_odom.training.cluster import environment_of, find_world, has_joined, share
 from rcnn_odom.training.datamodule import OdometryDataModule
@@ -148,9 +149,16 @@ def _has_one_process(options: Settings) -> bool:
 def _training_options(settings: Settings, run: Path) -> Settings:
     max_time = settings["trainer"].get("max_time")
     saving = Saving(run / LAST, seconds_of(max_time) if max_time else None)
+    decay = settings["model"].get("averaging")
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
-        "callbacks": [Layout(), TrainingLog(), Best(run / BEST), saving],
+        "callbacks": [
+            *([Averaging(decay)] if decay else []),
+            Layout(),
+            TrainingLog(),
+            Best(run / BEST),
+            saving,
+        ],
         "max_epochs": settings["model"]["epochs"],
         "num_sanity_val_steps": 0,
     }

@@ -45,8 +45,15 @@ def find_method(name: str, options: dict[str, Any], voxels: dict[str, dict[str, 
 
 
 def _network(stepper: Stepper) -> MakeTracker:
-    """A network on the sets of the laser that it was trained for."""
-    return lambda loaded: PairTracker(stepper) if stepper.description.sensor == loaded.sensor else None
+    """A network on the sets of the laser that it was trained for, or whose scans it can draw."""
+
+    def make(loaded: LoadedSet) -> ScanTracker | None:
+        tracker = PairTracker(stepper)
+        if stepper.description.warping is None:
+            return tracker if stepper.description.sensor == loaded.sensor else None
+        return None if tracker.beam_check(loaded.scans[0]) else PairTracker(stepper)
+
+    return make
 
 
 def _tracker(
