@@ -11,7 +11,7 @@ install: .venv/installed
 	touch $@
 
 train: install
-	$(BIN)/python train.py model=rcnn_reg
+	$(BIN)/python train.py model=cnn_warp
 
 # One thread for each of two processes.
 PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import AccumulatedCovariance, Step, advance, relative_step
+from rcnn_odom.geometry import FORWARD_CAMERA, AccumulatedCovariance, Step, advance, compose, relative_step
 from rcnn_odom.models.cnn_warp import FINE, CNNWarp, LocalConstraints, compare, invert, log_determinant
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import PairTracker, as_used
@@ -17,6 +17,7 @@ from rcnn_odom.models.rcnn_warp import RCNNWarp
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.warping import WarpingStepper
+from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
 
 SENSOR = Sensor(resolution_deg=1.0)
@@ -414,6 +415,29 @@ def test_another_first_stage_is_refused():
     network = RCNNWarp(OPTIONS | RECURRENT, SENSOR)
     with pytest.raises(InputError, match=r"kernel_size=5, but model\.kernel_size is 3"):
         network.take_first_stage(CNNWarp(OPTIONS | {"kernel_size": 5}, SENSOR))
+
+
+def test_a_drive_goes_on_where_the_place_is_not_known(monkeypatch):
+    """As in a stream: the last motion, of which nobody knows how wrong it is."""
+    network = CNNWarp(OPTIONS, SENSOR)
+    told = [Step(1.0, 0.0, 0.1, np.eye(3)), Step(*[math.nan] * 3), Step(2.0, 0.0, 0.0, np.eye(3))]
+    monkeypatch.setattr(network, "stepper", lambda: lambda pair: told.pop(0))
+    steps = network.estimate_scans(torch.zeros(4, SENSOR.bins))
+    assert steps.values[:, 0].tolist() == [1.0, 1.0, 2.0]
+    assert np.isnan(steps.covariances[1]).all()
+
+
+def test_calibration_scales_the_deviations_and_keeps_no_period():
+    scans, steps = drive(30)
+    network = CNNWarp(OPTIONS, SENSOR)
+    its = Drive("a", "k", scans, compose(steps), np.arange(30.0), FORWARD_CAMERA)
+    network.calibrate([its])
+    estimate = network.estimate(its)
+    deviations = np.sqrt(np.diagonal(estimate.covariances, axis1=1, axis2=2))
+    known = np.isfinite(deviations).all(1)
+    within = (np.abs(estimate.values - steps) <= deviations)[known].mean(0)
+    assert within == pytest.approx([0.68] * 3, abs=0.06)
+    assert math.isnan(network.describe().period)
 
 
 def test_pairs_that_do_not_share_their_scans_are_refused():

@@ -13,7 +13,7 @@ Training draws the guesses: any pair of scans whose motion is known gives pairs 
 import math
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, ClassVar
 
 import numpy as np
@@ -22,7 +22,16 @@ from torch import Tensor, nn
 from torch.nn import functional
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import FloatArray, Steps, advance, compose, poses_to_planar, relative_step
+from rcnn_odom.geometry import (
+    FloatArray,
+    Step,
+    Steps,
+    advance,
+    compose,
+    poses_to_planar,
+    relative_step,
+    unknown_covariance,
+)
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.reprojection import DepthVector, render_many
@@ -246,18 +255,33 @@ class ResidualNetwork(TrainedModel):
         return motion * self.units, invert(matrix) * units * units.unsqueeze(-1), state
 
     def estimate_scans(self, scans: Tensor) -> Steps:
-        """The steps of encoded scans (N, bins): as in a stream, in full precision."""
+        """The steps of encoded scans (N, bins): as in a stream, in full precision.
+
+        Where it does not know the place the last motion goes on, as in
+        :class:`rcnn_odom.models.pairs.PairTracker`, with an unknown covariance.
+        """
         stepper, values = self.stepper(), scans.cpu().numpy()
+        steps: list[Step] = []
         with torch.autocast(scans.device.type, enabled=False):
-            steps = [stepper(values[frame : frame + 2]) for frame in range(len(values) - 1)]
+            for frame in range(len(values) - 1):
+                step = stepper(values[frame : frame + 2])
+                if not np.isfinite(step.array()).all():
+                    step = replace(
+                        steps[-1] if steps else Step(0.0, 0.0, 0.0), covariance=unknown_covariance()
+                    )
+                steps.append(step)
         return Steps(
             np.array([step.array() for step in steps]).reshape(-1, 3),
             np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
         )
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
-        """Fits the scale of the deviations as well: 68.27 % of the errors lie within one of them."""
+        """Fits the scale of the deviations as well: 68.27 % of the errors lie within one of them.
+
+        No period is kept: what is left of a motion is measured at any rate of scans.
+        """
         super().calibrate(drives)
+        self.period.fill_(torch.nan)
         self.scale.fill_(1.0)
         estimates = [self.estimate(drive) for drive in drives]
         errors = np.concatenate(
