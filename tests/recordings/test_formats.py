@@ -43,7 +43,7 @@ def stream(path, ring=None):
 def test_own_formats_and_an_added_one():
     formats = all_formats()
     assert set(formats) == {
-        *("kitti", "kitti_raw", "carmen", "rosbag", "json_lines", "simulated"),
+        *("kitti", "kitti_raw", "carmen", "rosbag", "json_lines", "simulated", "logs", "mixed"),
         "stub_drives",
     }
     assert (find_format("kitti"), find_format("stub_drives")) == (kitti, stub_drives)

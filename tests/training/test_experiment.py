@@ -519,7 +519,7 @@ def test_a_mistake_on_the_command_line_gives_a_line_and_a_status(tmp_path, argum
 def test_help_prints_the_options():
     command = [sys.executable, str(ROOT / "train.py"), "--help"]
     done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert "data: all_round, blind, carmen, indoor, kitti" in done.stdout
+    assert "data: all_round, blind, carmen, half_circle, indoor, kitti" in done.stdout
     assert "kernel_size: 3" in done.stdout
 
 

@@ -331,7 +331,7 @@ def test_other_variant_is_refused(tmp_path):
 
 def test_other_sensor_is_refused(tmp_path):
     path = save(build("cnn_reg"), tmp_path / "best.ckpt")
-    with pytest.raises(InputError, match=r"best\.ckpt: trained for .*180.*360"):
+    with pytest.raises(InputError, match=r"best\.ckpt: trained with .*180.*360"):
         load_module(path, sensor=Sensor())
 
 
