@@ -35,7 +35,7 @@ from rcnn_odom.geometry import (
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.reprojection import DepthVector, render_many
-from rcnn_odom.models.streaming import Warping
+from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
 from rcnn_odom.models.uncertainty import WITHIN
 from rcnn_odom.options import option
@@ -213,6 +213,8 @@ class ResidualNetwork(TrainedModel):
     Attributes:
         units: (3,) metres, metres and radians in which the head solves and the loss compares, so that all
             three count alike.
+        warping: how it is used in a stream.
+        typical_change: (3,) root mean square of the change of training steps, metres and radians.
         scale: (3,) by which its deviations are multiplied, fitted on validation drives; 1 before.
     """
 
@@ -225,6 +227,7 @@ class ResidualNetwork(TrainedModel):
         "key_turn_deg",
     )
     scale: Tensor
+    typical_change: Tensor
     units: Tensor
     warping: Warping
 
@@ -233,7 +236,24 @@ class ResidualNetwork(TrainedModel):
         self.warping = Warping(**{key: options[key] for key in Warping.__dataclass_fields__})
         self.drawn = self.warping.drawn(sensor)
         self.register_buffer("scale", torch.ones(3))
+        self.register_buffer("typical_change", torch.full((3,), torch.nan))
         self.register_buffer("units", torch.tensor([1.0, 1.0, options["radians_a_metre"]]), persistent=False)
+
+    def set_units(self, steps: FloatArray) -> None:
+        """Also told how much steps change."""
+        super().set_units(steps)
+        self.typical_change.copy_(torch.from_numpy(np.sqrt(np.square(np.diff(steps, axis=0)).mean(0))))
+
+    def take_weights(self, model: TrainedModel) -> None:
+        """Keeps how much the new steps change, too."""
+        typical_change = self.typical_change.clone()
+        super().take_weights(model)
+        self.typical_change.copy_(typical_change)
+
+    def describe(self) -> Description:
+        """Also how it is used."""
+        x, y, heading = self.typical_change.double().tolist()
+        return replace(super().describe(), warping=self.warping, typical_change=(x, y, heading))
 
     @abstractmethod
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:

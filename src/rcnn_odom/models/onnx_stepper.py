@@ -103,4 +103,14 @@ def _describe(metadata: dict[str, Any]) -> Description:
     values = [*metadata["typical_step"], metadata["least_filled"], metadata["period"]]
     x, y, heading, filled, period = (np.nan if value is None else float(value) for value in values)
     warping = Warping(**metadata["warping"]) if metadata.get("warping") else None
-    return Description(Sensor(**metadata["sensor"]), (x, y, heading), filled, period, warping)
+    change = [
+        np.nan if value is None else float(value) for value in metadata.get("typical_change", [None] * 3)
+    ]
+    return Description(
+        Sensor(**metadata["sensor"]),
+        (x, y, heading),
+        filled,
+        period,
+        warping,
+        (change[0], change[1], change[2]),
+    )

@@ -48,6 +48,7 @@ class Description:
             a step may be that is not known at all. nan if unknown.
         least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
         period: usual seconds between scans in training; nan if unknown.
+        typical_change: root mean square of the change of steps from scan to scan; nan if unknown.
         warping: how a network that measures residual motions is used; None: it is given pairs as they are.
     """
 
@@ -56,6 +57,7 @@ class Description:
     least_filled: float = np.nan
     period: float = np.nan
     warping: Warping | None = None
+    typical_change: tuple[float, float, float] = (np.nan, np.nan, np.nan)
 
     @property
     def input_sensor(self) -> Sensor:

@@ -14,7 +14,6 @@ from rcnn_odom.geometry import FloatArray, Step, Steps
 from rcnn_odom.models.contract import Description, Model, Stepper
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import as_used
-from rcnn_odom.models.streaming import Warping
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
@@ -73,7 +72,6 @@ class TrainedModel(nn.Module, Model):
             None: there is none.
         only_in_training: options beside the recipe's that do not change what trained weights compute, such as
             those of the loss: a checkpoint with other values of them can be fine-tuned.
-        warping: how a network that measures residual motions is used; see :class:`.streaming.Warping`.
         typical_step: (3,) root mean square of the training steps, metres and radians; not for
             :meth:`forward`, since fine-tuning changes it under the same weights.
         least_filled: share of bins with a return below which a scan is unlike any validation scan; nan
@@ -84,7 +82,6 @@ class TrainedModel(nn.Module, Model):
     trains: ClassVar[bool] = True
     first_stage: ClassVar[str | None] = None
     only_in_training: ClassVar[tuple[str, ...]] = ()
-    warping: Warping | None = None
     typical_step: Tensor
     least_filled: Tensor
     period: Tensor
@@ -186,9 +183,7 @@ class TrainedModel(nn.Module, Model):
     def describe(self) -> Description:
         """What an odometer has to know."""
         x, y, heading = self.typical_step.double().tolist()
-        return Description(
-            self.sensor, (x, y, heading), float(self.least_filled), float(self.period), self.warping
-        )
+        return Description(self.sensor, (x, y, heading), float(self.least_filled), float(self.period))
 
     def stepper(self) -> Stepper:
         """One pair after the other, computed by PyTorch; robots run the exported file, which is faster."""

@@ -23,10 +23,12 @@ TABLE: tuple[Row, ...] = (
     *_by_place("width_deg", "*", 0.5, 0.1),
     # A step of 5 cm is small beside bins of a degree; half of the paper's bins hold no return of an HDL-64.
     *_by_place("drawn_deg", "*", 0.25, 0.2),
+    ("key_distance", "*", "all_round", "*", 1.0),  # robots and cars
     *_by_place("key_distance", "*", 0.5, 2.0),
     *_by_place("radians_a_metre", "*", 0.2, 0.05),  # walls are 5 m away, or 20
     *_by_place("residual_x", "*", 0.15, 0.5),
     *_by_place("residual_y", "*", 0.1, 0.2),
+    ("residual_heading_deg", "*", "all_round", "*", 3.0),
     *_by_place("residual_heading_deg", "*", 5.0, 1.5),
     ("repeat", "*", "*", "small", 8),  # each time with another guess
     ("repeat", "*", "*", "*", 1),

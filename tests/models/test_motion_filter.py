@@ -1,0 +1,87 @@
+"""The Kalman filter of a motion, against textbook equations in one dimension and against drawn errors."""
+
+import math
+
+import numpy as np
+import pytest
+
+from rcnn_odom.geometry import advance, relative_step
+from rcnn_odom.models.motion_filter import MotionFilter
+
+CHANGE, TYPICAL = np.array([0.05, 0.02, 0.003]), np.array([1.0, 0.05, 0.02])
+
+
+def textbook(measured, noise, change, first):
+    """Poses along x of a filter of position and velocity, written with its usual matrices."""
+    transition, seen = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
+    state, covariance = np.zeros(2), np.diag([0.0, (2 * first) ** 2])
+    poses = []
+    for place in measured:
+        # The velocity changes before it is driven.
+        covariance = covariance + np.diag([0.0, change**2])
+        state, covariance = transition @ state, transition @ covariance @ transition.T
+        gain = covariance @ seen.T / (seen @ covariance @ seen.T + noise**2)
+        state = state + gain[:, 0] * (place - state[0])
+        covariance = covariance - gain @ seen @ covariance
+        poses.append((state[0], covariance[0, 0]))
+    return np.array(poses)
+
+
+def test_along_a_line_it_is_the_textbooks():
+    rng = np.random.default_rng(0)
+    measured = np.cumsum(1.0 + 0.05 * rng.standard_normal(30)) + 0.3 * rng.standard_normal(30)
+    expected = textbook(measured, 0.3, CHANGE[0], TYPICAL[0])
+    one, pose, got = MotionFilter(CHANGE, TYPICAL), np.zeros(3), []
+    for place in measured:
+        guess = advance(pose, one.motion)
+        believed, _, _ = one.correct(np.array([place - guess[0], 0.0, 0.0]), np.diag([0.09, 1e-4, 1e-6]))
+        pose = advance(guess, believed)
+        got.append((pose[0], one.pose_covariance[0, 0]))
+    assert np.allclose(got, expected, rtol=1e-6)
+
+
+def test_what_is_measured_surely_is_believed_whole():
+    one = MotionFilter(CHANGE, TYPICAL)
+    residual, noise = np.array([0.9, 0.1, 0.05]), np.diag([1e-8, 1e-8, 1e-10])
+    believed, step, taken = one.correct(residual, noise)
+    assert np.allclose(believed, residual, atol=1e-5)
+    assert np.allclose(np.diag(step), [1e-8, 1e-8, 1e-10], rtol=1e-3)
+    assert np.allclose(np.diag(taken), [1e-8, 1e-8, 1e-10], rtol=1e-3)
+    assert one.motion == pytest.approx(residual, abs=1e-4)
+
+
+def test_what_is_not_seen_goes_on_and_gets_less_sure():
+    one = MotionFilter(CHANGE, TYPICAL)
+    for _ in range(5):
+        one.correct(np.array([1.0, 0.0, 0.0]) - one.motion, np.diag([1e-4, 1e-4, 1e-6]))
+    motion, deviations = one.motion, []
+    for _ in range(100):
+        # Nothing is seen along x, and what the network says there is always a little too far.
+        _, step, _ = one.correct(np.array([0.02, 0.0, 0.0]), np.diag([0.5, 1e-4, 1e-6]))
+        deviations.append(math.sqrt(step[0, 0]))
+    assert one.motion[0] - motion[0] < 0.2  # where taking all of it up would add 2
+    assert deviations[50] > 2 * deviations[0]
+
+
+def test_covariances_are_those_of_drawn_errors():
+    """Steps and poses beside a key of 3,000 drives that turn, by what they told before."""
+    rng = np.random.default_rng(1)
+    change, noise = np.array([0.03, 0.01, 0.004]), np.array([0.05, 0.2, 0.01])
+    steps, poses = [], []
+    for _ in range(3000):
+        one = MotionFilter(change, TYPICAL)
+        motion = 2 * TYPICAL * rng.standard_normal(3) * [1, 1, 0.2]
+        true, pose = np.zeros(3), np.zeros(3)
+        for _ in range(6):
+            motion = motion + change * rng.standard_normal(3)
+            before_true, true = true, advance(true, motion)
+            guess = advance(pose, one.motion)
+            measured = advance(true, noise * rng.standard_normal(3))
+            believed, step, _ = one.correct(relative_step(guess, measured), np.diag(noise**2))
+            before, pose = pose, advance(guess, believed)
+        steps.append(
+            (relative_step(before, pose) - relative_step(before_true, true)) / np.sqrt(np.diag(step))
+        )
+        poses.append(relative_step(true, pose) / np.sqrt(np.diag(one.pose_covariance)))
+    assert np.sqrt(np.mean(np.square(steps), axis=0)) == pytest.approx([1, 1, 1], abs=0.15)
+    assert np.sqrt(np.mean(np.square(poses), axis=0)) == pytest.approx([1, 1, 1], abs=0.15)
