@@ -88,6 +88,11 @@ class LSTM(nn.Module):
             after.append((h, c))
         return inputs, tuple(map(torch.stack, zip(*after, strict=True)))
 
+    def initial_state(self) -> dict[str, Tensor]:
+        """Zeros (layers, 1, hidden): the hidden and the cell state before the first step."""
+        shape = len(self.weight_ih), 1, self.hidden
+        return {"h": torch.zeros(shape), "c": torch.zeros(shape)}
+
 
 class FirstStage(nn.Module):
     """The encoder of the CNN that is trained first, and its head.
@@ -139,9 +144,8 @@ class RecurrentModel(TwoNumberModel):
         return self.head(outputs)._replace(first_stage=first_stage), state
 
     def initial_state(self) -> dict[str, Tensor]:
-        """Zeros (layers, 1, hidden): the LSTM's hidden and cell state."""
-        shape = len(self.lstm.weight_ih), 1, self.lstm.hidden
-        return {"h": torch.zeros(shape), "c": torch.zeros(shape)}
+        """Of the LSTM."""
+        return self.lstm.initial_state()
 
     def take_first_stage(self, model: TrainedModel) -> None:
         """Takes encoder and head of a trained CNN.

@@ -4,7 +4,6 @@ The first stage is :mod:`rcnn_odom.models.cnn_warp`. Its features, its residual 
 that go into LSTM layers, whose output corrects the motion and its information (paper III-C2, fig. 2).
 """
 
-import math
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -94,9 +93,8 @@ class RCNNWarp(ResidualNetwork):
         return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state
 
     def initial_state(self) -> dict[str, Tensor]:
-        """Zeros (layers, 1, hidden): the LSTM's hidden and cell state."""
-        shape = len(self.lstm.weight_ih), 1, self.lstm.hidden
-        return {"h": torch.zeros(shape), "c": torch.zeros(shape)}
+        """Of the LSTM."""
+        return self.lstm.initial_state()
 
     def take_first_stage(self, model: TrainedModel) -> None:
         """Takes encoder and constraints of a trained first stage.
@@ -144,9 +142,7 @@ class RCNNWarp(ResidualNetwork):
                 residuals[n, t - 1] = relative_step(guess, poses[n, t])
                 before, estimate = estimate, advance(poses[n, t], off[t])
                 motion = relative_step(before, estimate)
-                x, y, heading = relative_step(poses[n, key], estimate)
-                is_turned = abs(heading) >= math.radians(self.warping.key_turn_deg)
-                if math.hypot(x, y) >= self.warping.key_distance or is_turned:
+                if self.warping.needs_key(relative_step(poses[n, key], estimate)):
                     key, estimate = t, poses[n, t]
         later = np.ascontiguousarray(scans[:, 1:])
         return self.draw_scans(earlier, later, guesses, residuals, rng, batch["pairs"].device)

@@ -1,5 +1,6 @@
 """What a model is in a stream: of pairs of encoded scans, or of whole scans."""
 
+import math
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -32,6 +33,12 @@ class Warping:
     radians_a_metre: float
     key_distance: float
     key_turn_deg: float
+
+    def needs_key(self, pose: FloatArray) -> bool:
+        """Whether a pose (3,) in the frame of the key scan is far enough away for a new key."""
+        x, y, heading = pose.tolist()
+        is_turned = abs(heading) >= math.radians(self.key_turn_deg)
+        return math.hypot(x, y) >= self.key_distance or is_turned
 
     def drawn(self, sensor: Sensor) -> Sensor:
         """The bins that scans of a sensor are drawn into."""

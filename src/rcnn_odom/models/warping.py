@@ -60,7 +60,7 @@ class WarpingStepper:
         pose = advance(expected, believed)
         x, y, heading = relative_step(self._pose, pose).tolist()
         self._last, self._pose = pair[1].copy(), pose
-        if self._is_far(pose):
+        if self.warping.needs_key(pose):
             self._take_key(pair[1])
             taken_back = np.zeros((3, 3))
         return Step(x, y, heading, covariance, taken_back)
@@ -70,12 +70,6 @@ class WarpingStepper:
         self._key = scan.copy()
         self._pose = np.zeros(3)
         self._filter.take_key()
-
-    def _is_far(self, pose: FloatArray) -> bool:
-        """Whether a pose (3,) in the frame of the key scan is far enough away for a new key."""
-        x, y, heading = pose.tolist()
-        is_turned = abs(heading) >= math.radians(self.warping.key_turn_deg)
-        return math.hypot(x, y) >= self.warping.key_distance or is_turned
 
     def _measure(
         self, scan: npt.NDArray[np.float32], expected: FloatArray
