@@ -112,8 +112,24 @@ class Perfect:
 
 
 @pytest.fixture
-def perfect(monkeypatch):
-    """Makes a stepper around a perfect network, which is told what the stepper draws."""
+def spied(monkeypatch):
+    """Makes a stepper around a network of this page, which is told what the stepper draws."""
+
+    def make(network):
+        def spy(depth, sensor, viewpoint, out):
+            found = [n for n, scan in enumerate(network.scans) if np.array_equal(scan, depth)]
+            network.seen = found[0], np.array(viewpoint, float)
+            return render(depth, sensor, viewpoint, out)
+
+        monkeypatch.setattr("rcnn_odom.models.warping.render", spy)
+        return WarpingStepper(network)
+
+    return make
+
+
+@pytest.fixture
+def perfect(spied):
+    """Makes a stepper around a perfect network."""
 
     def make(scans, steps, **options):
         given = {
@@ -125,15 +141,7 @@ def perfect(monkeypatch):
             "key_turn_deg": 20.0,
         } | options
         covariance = given.pop("covariance", None)
-        network = Perfect(scans, steps, Warping(**given), covariance)
-
-        def spy(depth, sensor, viewpoint, out):
-            found = [n for n, scan in enumerate(scans) if np.array_equal(scan, depth)]
-            network.seen = found[0], np.array(viewpoint, float)
-            return render(depth, sensor, viewpoint, out)
-
-        monkeypatch.setattr("rcnn_odom.models.warping.render", spy)
-        return WarpingStepper(network)
+        return spied(Perfect(scans, steps, Warping(**given), covariance))
 
     return make
 
@@ -176,6 +184,29 @@ def test_nan_of_the_network_is_no_step_and_it_begins_again(perfect, bad):
     stepper.network.poses = [*poses[:2], np.full(3, bad), *poses[3:]]
     assert np.isnan(stepper(scans[1:3]).array()).all()
     assert np.allclose(stepper(scans[3:5]).array(), steps[3], atol=1e-6)
+
+
+def test_several_looks_along_a_bare_wall_do_not_add_up(spied):
+    """A network that hardly knows, but says 10 cm ahead wherever it looks from, moves little by that."""
+
+    class Wandering(Perfect):
+        def __call__(self, pair):
+            _, y, heading = super().__call__(pair).array()
+            return Step(0.1, y, heading, np.diag([0.04, 1e-9, 1e-11]))
+
+    def first_step(passes):
+        network = Wandering(scans, steps, Warping(0.5, passes, 0.0, 0.05, 100.0, 20.0))
+        network.description = replace(
+            network.description, typical_step=(0.05, 0.05, 0.05), typical_change=(0.01, 0.01, 0.01)
+        )
+        return spied(network)(scans[:2]).array()
+
+    scans, steps = drive()
+    once, often = first_step(1), first_step(6)
+    # Of 10 cm a share of 0.2 is believed, again and again: at most 0.2 / (1 - 0.2).
+    assert once[0] == pytest.approx(0.02, abs=0.002)
+    assert often[0] == pytest.approx(0.025, abs=0.002)
+    assert often[2] == pytest.approx(steps[0][2], abs=1e-4)
 
 
 def test_a_network_that_jumps_about_has_no_step():

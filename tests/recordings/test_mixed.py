@@ -68,11 +68,6 @@ def test_a_recording_is_its_sources_own_under_a_longer_name(log_folder):
             {"speed": 3},
             "data.sources.logs: got an unexpected keyword argument 'speed'; carmen has",
         ),
-        (
-            "logs/robot",
-            {"reference": "matcher"},
-            "data.sources.logs.reference=matcher: is not for",
-        ),
         ("logs/robot", {"partial": "maybe"}, "data.sources.logs.partial=maybe: must be true or false"),
     ],
 )

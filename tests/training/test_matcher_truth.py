@@ -10,10 +10,12 @@ from evaluate import evaluate
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import planar_to_poses, relative_steps
 from rcnn_odom.models.matcher import Matcher
-from rcnn_odom.recordings import carmen, logs
+from rcnn_odom.recordings import carmen, logs, simulated
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training import matcher_truth
 from rcnn_odom.training.matcher_truth import MatcherTruth
+from rcnn_odom.training.settings import plain
+from rcnn_odom.training.stages import build_datamodule
 from train import train
 
 LENGTHS = "data.lengths=[1.0,2.0]"
@@ -52,6 +54,17 @@ def test_marked_steps_are_counted_and_not_trusted(folder, tmp_path):
     note = next(note for note in opened.notes if note.startswith("truth: scan matching"))
     assert note.startswith(f"truth: scan matching; {marked} of 69 steps are marked and not trained on (")
     assert "10 no returns" in note
+
+
+def test_of_several_sources_only_those_without_poses_get_them(folder, configure, tmp_path):
+    """``data=mixed``: a log by scan matching, beside simulated rooms, whose truth is known."""
+    sources = [f"data.sources.logs.root={folder[0]}", "data.sources.logs.reference=matcher"]
+    cfg = configure("model=cnn_warp", "data=mixed", *sources, "+data.sources.sick.frames=30")
+    opened = build_datamodule(plain(cfg)).open_recording
+    path = Matcher({}, None).estimate(Drive.unencoded(open_log("robot.log", folder[0])())).values
+    np.testing.assert_allclose(relative_steps(opened("logs/robot").poses), path, atol=1e-9)
+    room = simulated.load("00", world="indoor", frames=30, laser={"kind": "sick", "spacing_deg": 1.0})
+    np.testing.assert_array_equal(opened("sick/00").poses, room.poses)
 
 
 def test_the_path_is_computed_once(folder, tmp_path, monkeypatch, caplog):

@@ -24,16 +24,15 @@ from torch.nn import functional
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import (
     FloatArray,
-    Step,
     Steps,
     advance,
     compose,
     poses_to_planar,
     relative_step,
-    unknown_covariance,
 )
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.encoding import Sensor
+from rcnn_odom.models.pairs import estimate_pairs
 from rcnn_odom.models.reprojection import DepthVector, render_many
 from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
@@ -275,25 +274,12 @@ class ResidualNetwork(TrainedModel):
         return motion * self.units, invert(matrix) * units * units.unsqueeze(-1), state
 
     def estimate_scans(self, scans: Tensor) -> Steps:
-        """The steps of encoded scans (N, bins): as in a stream, in full precision.
-
-        Where it does not know the place the last motion goes on, as in
-        :class:`rcnn_odom.models.pairs.PairTracker`, with an unknown covariance.
-        """
-        stepper, values = self.stepper(), scans.cpu().numpy()
-        steps: list[Step] = []
+        """The steps of encoded scans (N, bins): as in a stream, in full precision."""
+        values = scans.cpu().numpy()
         with torch.autocast(scans.device.type, enabled=False):
-            for frame in range(len(values) - 1):
-                step = stepper(values[frame : frame + 2])
-                if not np.isfinite(step.array()).all():
-                    step = replace(
-                        steps[-1] if steps else Step(0.0, 0.0, 0.0), covariance=unknown_covariance()
-                    )
-                steps.append(step)
-        return Steps(
-            np.array([step.array() for step in steps]).reshape(-1, 3),
-            np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
-        )
+            return estimate_pairs(
+                self.stepper(), (values[frame : frame + 2] for frame in range(len(values) - 1))
+            )
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
         """Fits the scale of the deviations as well: 68.27 % of the errors lie within one of them.

@@ -42,6 +42,21 @@ class MotionFilter:
         """(3, 3) of the last scan's pose beside the key, in the scan's own frame."""
         return self._errors[:3, :3].copy()
 
+    def weigh(self, residual: FloatArray, covariance: FloatArray) -> FloatArray:
+        """What of a residual (3,) would be believed: see :meth:`correct`, which also takes it in."""
+        pose, motion, both = self._predict()
+        expected, turn = pose + motion + both + both.T, float(self.motion[2])
+        gain = expected @ np.linalg.inv(expected + turn_covariance(covariance, turn))
+        return _rotate(gain @ _rotate(residual, turn), -turn)
+
+    def _predict(self) -> tuple[FloatArray, FloatArray, FloatArray]:
+        """Covariances (3, 3) at the next scan: of the pose, of the motion, and of both together."""
+        motion = self._errors[3:, 3:] + np.diag(np.square(self._change))
+        # An error of the heading moves the place that the motion leads to.
+        x, y, _ = self.motion.tolist()
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        return lever @ self._errors[:3, :3] @ lever.T, motion, lever @ self._errors[:3, 3:]
+
     def correct(
         self, residual: FloatArray, covariance: FloatArray
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -56,13 +71,9 @@ class MotionFilter:
             of the scan before; and the part of the pose's (3, 3) that the next measurement takes back, in the
             scan's own frame.
         """
-        pose, motion, both = self._errors[:3, :3], self._errors[3:, 3:], self._errors[:3, 3:]
-        motion = motion + np.diag(np.square(self._change))
-        # An error of the heading moves the place that the motion leads to.
-        x, y, turn = self.motion.tolist()
-        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        pose, both = lever @ pose @ lever.T, lever @ both
+        pose, motion, both = self._predict()
         expected = pose + motion + both + both.T
+        turn = float(self.motion[2])
         measured = turn_covariance(covariance, turn)  # told of the frame of the scan before, as all here
         gain = expected @ np.linalg.inv(expected + measured)
         of_motion = (both.T + motion) @ np.linalg.inv(expected + measured)

@@ -1,12 +1,14 @@
 """Models that look at pairs of encoded scans, in a stream of whole scans."""
 
 import math
+from collections.abc import Iterable
+from dataclasses import replace
 from typing import cast
 
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.geometry import FloatArray, Step, advance, relative_covariance
+from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_covariance, unknown_covariance
 from rcnn_odom.models.encoding import decode
 from rcnn_odom.models.streaming import Network, Registered, Stepper
 from rcnn_odom.recordings.beams import BeamCheck
@@ -158,3 +160,22 @@ class PairTracker:
         stays = relative_covariance(Step(x, y, heading), 2 * self._open, np.zeros((3, 3)))
         self._open = np.zeros((3, 3))
         return Registered(Step(x, y, heading, covariance + stays), tuple(notes), is_estimated=False)
+
+
+def estimate_pairs(stepper: Stepper, pairs: Iterable[npt.NDArray[np.float32]]) -> Steps:
+    """The steps of a row of pairs of encoded scans (2, bins), of which each begins where the last one ends.
+
+    Where the stepper does not know the place (nan), the last motion goes on, as in :class:`PairTracker`, with
+    an unknown covariance.
+    """
+    steps: list[Step] = []
+    for pair in pairs:
+        step = stepper(pair)
+        if not np.isfinite(step.array()).all():
+            last = steps[-1] if steps else Step(0.0, 0.0, 0.0)
+            step = replace(last, covariance=unknown_covariance())
+        steps.append(step)
+    return Steps(
+        np.array([step.array() for step in steps]).reshape(-1, 3),
+        np.array([step.covariance for step in steps]).reshape(-1, 3, 3),
+    )

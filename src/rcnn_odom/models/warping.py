@@ -13,8 +13,9 @@ from rcnn_odom.models.motion_filter import MotionFilter
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
-LOST = 5.0
-"""Times ``settled``: where the last of several corrections is larger, the network does not know the place."""
+LOST = 0.5
+"""Metres: after a larger correction nothing of the prediction is kept. Where the last of several still is
+that large, the network does not know the place."""
 
 
 class WarpingStepper:
@@ -76,22 +77,31 @@ class WarpingStepper:
     ) -> tuple[FloatArray, FloatArray] | None:
         """Where a scan was taken, seen from where it is expected (3,), and the covariance (3, 3) of that.
 
-        None where the network finds no place for it. The expected pose (3,) is told of the key's frame.
+        None where the network finds no place for it. The expected pose (3,) is told of the key's frame. It is
+        compared again from where it is believed to be, not from where it was measured (an iterated Kalman
+        filter): along a bare wall the place to compare from must not wander off with the measurements.
         """
         now = render(scan, self.description.sensor, np.zeros(3), self._drawn)
-        pose = expected
+        believed = np.zeros(3)
         for number in range(self.warping.passes):
             if number:
                 self.network.forget_last()  # of several passes the last one is the scan's
+            pose = advance(expected, believed)
             before = render(self._key, self.description.sensor, pose, self._drawn)
             residual = self.network(np.stack([before, now]))
-            correction = math.hypot(residual.x, residual.y, residual.heading / self.warping.radians_a_metre)
-            if not math.isfinite(correction):
+            if not np.isfinite(residual.array()).all():
                 return None
-            pose = advance(pose, residual.array())
-            if correction < self.warping.settled:
+            whole = relative_step(expected, advance(pose, residual.array()))
+            covariance = turn_covariance(residual.covariance, float(whole[2]) - residual.heading)
+            last, is_far_off = believed, self._size(residual.array()) > LOST
+            believed = whole if is_far_off else self._filter.weigh(whole, covariance)
+            if self._size(believed - last) < self.warping.settled:
                 break
-        if number and correction > LOST * self.warping.settled > 0:
+        if number and is_far_off:
             return None  # it jumps about
-        whole = relative_step(expected, pose)
-        return whole, turn_covariance(residual.covariance, float(whole[2]) - residual.heading)
+        return whole, covariance
+
+    def _size(self, motion: FloatArray) -> float:
+        """Of a motion (3,) in metres, its turn by ``radians_a_metre``."""
+        x, y, heading = motion.tolist()
+        return math.hypot(x, y, heading / self.warping.radians_a_metre)

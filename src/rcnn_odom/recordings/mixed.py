@@ -9,7 +9,6 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.options import option
 from rcnn_odom.recordings import formats
 from rcnn_odom.recordings.recording import Recording
-from rcnn_odom.recordings.reference import MATCHER
 
 PARTLY = "partial"
 """Option of a source: its laser may be a part of ``data.sensor``."""
@@ -62,11 +61,6 @@ def load(name: str, *, sources: Mapping[str, Mapping[str, Any]]) -> Recording:
     partly = reader.pop(PARTLY, False)
     if not isinstance(partly, bool):
         raise InputError(f"data.sources.{source}.{PARTLY}={partly}: must be true or false")
-    if reader.get("reference") == MATCHER:
-        raise InputError(
-            f"data.sources.{source}.reference={MATCHER}: is not for data=mixed; give a folder of poses, or "
-            "train on these recordings alone"
-        )
     try:
         recording = formats.open_recording(reader)(own_name)
     except InputError as error:

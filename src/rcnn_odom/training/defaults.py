@@ -25,6 +25,7 @@ TABLE: tuple[Row, ...] = (
     *_by_place("drawn_deg", "*", 0.25, 0.2),
     ("key_distance", "*", "all_round", "*", 1.0),  # robots and cars
     *_by_place("key_distance", "*", 0.5, 2.0),
+    *_by_place("settled", "*", 0.01, 0.1),
     *_by_place("radians_a_metre", "*", 0.2, 0.05),  # walls are 5 m away, or 20
     *_by_place("residual_x", "*", 0.15, 0.5),
     *_by_place("residual_y", "*", 0.1, 0.2),

@@ -15,7 +15,7 @@ from rcnn_odom.evaluation.scores import coverage, coverage_table, score_all, tab
 from rcnn_odom.geometry import Steps
 from rcnn_odom.models.contract import Stepper
 from rcnn_odom.models.onnx_stepper import OnnxStepper
-from rcnn_odom.models.pairs import PairTracker, as_used
+from rcnn_odom.models.pairs import PairTracker, as_used, estimate_pairs
 from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive
@@ -139,8 +139,7 @@ def stream_steps(stepper: Stepper, drive: Drive) -> Steps:
     stepper = as_used(stepper)
     stepper.reset()
     frames = tqdm(range(len(drive) - 1), desc=drive.name, unit="scan", disable=None, leave=False)
-    steps = [stepper(np.array(drive.scans[frame : frame + 2])) for frame in frames]
-    return Steps(np.stack([step.array() for step in steps]), np.stack([step.covariance for step in steps]))
+    return estimate_pairs(stepper, (np.array(drive.scans[frame : frame + 2]) for frame in frames))
 
 
 def _need_little_cost(reports: dict[str, Report], precision: str) -> None:

@@ -45,13 +45,13 @@ class MatchedPath(NamedTuple):
 
 
 class MatcherTruth:
-    """Opens recordings with the path of scan matching as their poses.
+    """Opens recordings, those without poses with the path of scan matching as theirs.
 
     A step that the matcher marks (held, no match, poor match, ...) is not to be learned from: the recording's
     ``trusted`` says so.
 
     Args:
-        open_recording: name -> recording, whose own poses are not used.
+        open_recording: name -> recording, whose poses are nan where they are to be found.
         folder: where paths are kept.
         deskew: ``data.deskew``.
     """
@@ -60,12 +60,14 @@ class MatcherTruth:
         self.open_recording, self.folder, self.deskew = open_recording, folder, deskew
 
     def __call__(self, name: str) -> Recording:
-        """The recording of this name.
+        """The recording of this name; of another source, which has poses, as it is.
 
         Raises:
             InputError: it cannot be opened, or the folder cannot be written.
         """
         recording = self.open_recording(name)
+        if not np.isnan(recording.poses).all():
+            return recording
         found = self._find(recording)
         trusted = found.marks == ""
         marked = int((~trusted[1:]).sum())

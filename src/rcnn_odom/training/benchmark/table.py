@@ -25,7 +25,7 @@ def _failures(scores: Report) -> str:
 
 def _path(scores: Report) -> str:
     ratio = scores["path_ratio"]
-    return NONE if ratio is None else f"{ratio:.2f}"
+    return NONE if ratio is None else f"{ratio:.3f}"
 
 
 def _stretch(scores: Report) -> str:
