@@ -3,28 +3,27 @@
     pip install PATH_OF_THIS_REPOSITORY    # into the Python of your ROS 2
     python3 ros2_node.py --ros-args -p base_frame:=base_link -r scan:=/my_laser
 
-Parameters: model (matcher, which is scan matching and needs no training; or rcnn_small, an exported .onnx or
-a .ckpt), odom_frame (odom), base_frame (empty), publish_tf (true). Publishes /odom and the transform from
-odom_frame to base_frame, in the header's stamp. With base_frame, poses are those of the robot, by the static
-transform from there to the laser; without it those of the laser, whose frame must then have no other parent,
-or publish_tf be false. The pose has the covariance that has accumulated since the first scan, the twist that
-of the last step over its time; what is unknown has a variance of 1e6. What an estimate suffers from (gaps,
-few returns) is logged; a scan that is passed over is not published. The file can be imported without ROS.
+Parameters: model (matcher, which is scan matching and needs no training; or all_round or half_circle, which
+ship along, an exported .onnx or a .ckpt), odom_frame (odom), base_frame (empty), publish_tf (true). Publishes
+/odom and the transform from odom_frame to base_frame, in the header's stamp. With base_frame, poses are those
+of the robot, by the static transform from there to the laser; without it those of the laser, whose frame must
+then have no other parent, or publish_tf be false. The pose has the covariance that has accumulated since the
+first scan, the twist that of the last step over its time; what is unknown, and z, roll and pitch, have a
+variance of 1e6. What an estimate suffers from (gaps, few returns) is logged; a scan that is passed over is
+not published. The file can be imported without ROS.
 """
 
 import math
 from contextlib import suppress
 from dataclasses import replace
-from itertools import product
 
+from rcnn_odom.cli.full import need_full
 from rcnn_odom.deployment.odometer import Odometer, Pose
+from rcnn_odom.deployment.ros_messages import ros_covariance
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import turn_to_middle, unknown_covariance
 from rcnn_odom.models.tracking import PASSED_OVER
 from rcnn_odom.recordings.rosbag import convert
-
-AXES = (0, 1, 5)  # x, y and yaw among the six of a covariance
-UNKNOWN = 1e6  # a variance that no filter takes for knowledge
 
 
 def fill(message, pose: Pose, seconds: float) -> None:
@@ -44,9 +43,7 @@ def fill(message, pose: Pose, seconds: float) -> None:
 
 def fill_covariance(values, covariance) -> None:
     """Writes a covariance (3, 3) of x, y and yaw among the 36 of a message."""
-    for i, j in product(range(3), repeat=2):
-        is_known = not math.isnan(covariance[i, j])
-        values[6 * AXES[i] + AXES[j]] = covariance[i, j] if is_known else UNKNOWN * (i == j)
+    values[:] = ros_covariance(covariance)
 
 
 def planar(transform) -> tuple[tuple[float, float, float], bool]:
@@ -68,6 +65,7 @@ def load(model: str) -> Odometer:
     if model == "matcher":
         return Odometer()
     if model.endswith(".ckpt"):
+        need_full(f"{model}: a checkpoint")
         from rcnn_odom.training.export import load_odometer
 
         return load_odometer(model, threads=1)

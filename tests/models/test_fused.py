@@ -251,7 +251,7 @@ def test_a_missing_file_is_told_in_one_line(tmp_path):
         check_options(Fused.Options, {"network": " "}, "model.")
 
 
-@pytest.mark.parametrize("network", ["held", "rcnn_small"])
+@pytest.mark.parametrize("network", ["held", "all_round", "half_circle"])
 def test_it_is_scored_like_any_model(configure, network):
     options = ["data=blind", "data.frames=30", "data.test=[tunnel-8]", "data.lengths=[5.0]"]
     cfg = configure("model=fused", f"model.network={network}", *options, "data.workers=1", name="evaluate")

@@ -4,12 +4,14 @@ import json
 import subprocess
 import sys
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from conftest import ROOT, SHARED
 from evaluate import evaluate
+from odometry import build
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import Step, planar_to_poses
 from rcnn_odom.models.contract import Registered
@@ -20,8 +22,10 @@ from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive, Recording
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.training.benchmark.measure import run_timed, score_timed
+from rcnn_odom.training.benchmark.methods import find_method
 from rcnn_odom.training.benchmark.sets import LoadedSet, SetOptions
 from rcnn_odom.training.benchmark.table import as_markdown, as_text
+from rcnn_odom.training.onnx_graph import to_onnx, write
 from rcnn_odom.training.settings import plain
 
 SHORT = [
@@ -60,11 +64,20 @@ def test_a_method_is_measured_on_every_set_that_is_there(measure_method, tmp_pat
     assert as_text(rows) in caplog.text
 
 
-def test_a_network_has_a_row_on_the_sets_of_its_laser(measure_method, caplog):
+@pytest.mark.parametrize(
+    ("network", "of_its_laser", "of_another"),
+    [("all_round", "street", "indoor"), ("half_circle", "indoor", "street"), ("tiny", "indoor", "street")],
+)
+def test_a_network_has_a_row_on_the_sets_of_its_laser(
+    measure_method, tmp_path, caplog, network, of_its_laser, of_another
+):
     caplog.set_level("INFO")
-    metrics = measure_method("rcnn_small")
-    assert list(metrics["benchmark"]) == ["street"]
-    assert "rcnn_small: indoor is of a laser that it was not trained for" in caplog.text
+    if network == "tiny":  # of those that are given encoded scans as they are
+        network = str(tmp_path / "tiny.onnx")
+        write(to_onnx(build(sensor=Sensor(1.0, 180.0, 40.0)), "fp32"), Path(network))
+    metrics = measure_method(network)
+    assert list(metrics["benchmark"]) == [of_its_laser]
+    assert f"{network}: {of_another} is of a laser that it was not trained for" in caplog.text
 
 
 @pytest.mark.parametrize(
@@ -154,7 +167,7 @@ def test_the_table_has_a_row_for_each_method():
     assert [line.split() for line in drift[1:]] == [["ours", "1.23", "1.23"], ["theirs", "-", "-"]]
     assert times[1].split() == ["ours", *["1.00", "/", "2.50"], *["1.00", "/", "2.50"]]
     assert failures[2].split() == ["theirs", "12", "(2", "errors)", "-"]
-    assert path[2].split() == ["theirs", "0.00", "-"]
+    assert path[2].split() == ["theirs", "0.000", "-"]
     # Only the columns that have such a score.
     assert relations[0].split()[-1] == "b"
     assert relations[1].endswith("4.6 cm, 0.35 deg")
@@ -187,17 +200,35 @@ def test_every_set_of_the_shipped_tables_can_be_read(configure):
     assert read > 10
 
 
+def test_the_shipped_networks_share_the_sets_of_the_table(configure):
+    """By the first scan of each: every set is of a laser that just one of them was trained for."""
+    if not (SHARED / "data").is_dir():
+        pytest.skip(f"no recordings in {SHARED}/data")
+    root = f"benchmark.root={SHARED}/data"
+    cfg = configure("benchmark=full", "benchmark.method=all_round", root, name="evaluate")
+    make = {name: find_method(name, {}, {}) for name in ("all_round", "half_circle")}
+    measured = {}
+    for title, options in plain(cfg)["benchmark"]["sets"].items():
+        recording = open_recording(options["reader"])(parse_part(options["recording"])[0])
+        loaded = LoadedSet(options, recording, Drive.unencoded(recording), [recording.read_scan(0)])
+        measured[title] = [name for name in make if make[name](loaded)]
+        turns_round = options["sensor"]["field_of_view_deg"] == 360
+        assert measured[title] == ["all_round" if turns_round else "half_circle"], title
+    assert measured["sim 05"] == measured["kitti 90"] == ["all_round"]
+    assert measured["ual"] == measured["aces"] == measured["freiburg-101"] == ["half_circle"]
+
+
 @pytest.mark.slow
 def test_the_sweep_writes_one_table(tmp_path):
     command = [sys.executable, "evaluate.py", "-m", "+sweeps=peers", "benchmark=quick", *SHORT]
     done = subprocess.run(
-        [*command, f"outputs={tmp_path}", "benchmark.method=kiss_icp,matcher,rcnn_small"],
+        [*command, f"outputs={tmp_path}", "benchmark.method=kiss_icp,matcher,all_round,half_circle"],
         cwd=ROOT,
         capture_output=True,
         text=True,
     )
     assert done.returncode == 0, done.stderr
     rows = json.loads((tmp_path / "peers" / "benchmark.json").read_text())["rows"]
-    assert list(rows) == ["kiss_icp", "matcher", "rcnn_small"]
+    assert list(rows) == ["kiss_icp", "matcher", "all_round", "half_circle"]
     assert done.stdout.count("drift, %") == 1
     assert f"also in {tmp_path}/peers/benchmark.md" in done.stdout

@@ -23,7 +23,7 @@ class ExportedOptions:
     """
 
     network: str = option(
-        default="rcnn_small",
+        default="all_round",
         fits=lambda network: bool(network.strip()),
         wanted="a network that ships along, or a file of rcnn-odom export",
     )

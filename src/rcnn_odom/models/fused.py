@@ -42,7 +42,7 @@ class FusedOptions:
     """
 
     network: str = option(
-        default="rcnn_small",
+        default="all_round",
         fits=lambda network: bool(network.strip()),
         wanted="a network that ships along, a file of rcnn-odom export, or held",
     )

@@ -7,10 +7,11 @@ from typing import Any
 from rcnn_odom.deployment.shipped import find_file, shipped_models
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST
-from rcnn_odom.models.contract import Model, ScanTracker, Stepper, find_model
+from rcnn_odom.models.contract import Description, Model, ScanTracker, Stepper, find_model
 from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.options import check_options
+from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.training.benchmark.sets import LoadedSet
 
 MakeTracker = Callable[[LoadedSet], ScanTracker | None]
@@ -45,15 +46,21 @@ def find_method(name: str, options: dict[str, Any], voxels: dict[str, dict[str, 
 
 
 def _network(stepper: Stepper) -> MakeTracker:
-    """A network on the sets of the laser that it was trained for, or whose scans it can draw."""
+    """A network on the sets of lasers that it was trained for."""
+    return lambda loaded: PairTracker(stepper) if _knows_laser(stepper.description, loaded) else None
 
-    def make(loaded: LoadedSet) -> ScanTracker | None:
-        tracker = PairTracker(stepper)
-        if stepper.description.warping is None:
-            return tracker if stepper.description.sensor == loaded.sensor else None
-        return None if tracker.beam_check(loaded.scans[0]) else PairTracker(stepper)
 
-    return make
+def _knows_laser(description: Description, loaded: LoadedSet) -> bool:
+    """Whether a set's laser is one that a network was trained for.
+
+    Where scans are drawn, beams may be farther apart than the sensor's and cover a part of its field of view.
+    But what has learned from lasers that turn all round is not measured on those that do not.
+    """
+    sensor = description.sensor
+    if description.warping is None:
+        return sensor == loaded.sensor
+    same_kind = (sensor.field_of_view_deg == 360) == (loaded.sensor.field_of_view_deg == 360)
+    return same_kind and not BeamCheck(sensor, partly=True)(loaded.scans[0])
 
 
 def _tracker(
