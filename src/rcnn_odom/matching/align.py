@@ -1,7 +1,8 @@
-"""Point-to-line alignment of a scan with a map: partners by bearing, robust weights, Gauss-Newton.
+"""Point-to-line alignment of a scan with a map by Gauss-Newton steps.
 
-Censi, "An ICP variant using a point-to-line metric", ICRA 2008. The weights are Cauchy's and the gate on the
-distance between partners closes from step to step.
+Censi, "An ICP variant using a point-to-line metric", ICRA 2008. Corresponding points are found by their
+bearings, residuals have Cauchy weights, and the largest distance between corresponding points (the gate)
+shrinks in every step.
 """
 
 from typing import NamedTuple
@@ -12,19 +13,19 @@ from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 BINS = 1024
-"""Bins of the table of bearings."""
+"""Bins of bearings in a :class:`Table`."""
 BEHIND = 1.0
-"""Metres by which the laser may stand behind a wall and still see it; its place is not exact."""
+"""Metres: a wall is kept if the laser is less far behind it, because the laser's position is uncertain."""
 FEWEST_PAIRS = 6
-"""Pairs without which nothing is aligned."""
+"""Minimum number of pairs for an alignment."""
 COARSE, ENOUGH = 3, 100
-"""While the gate is closing, every third point is enough, if at least a hundred are then left."""
+"""While the gate shrinks, only every third point is used, if that leaves at least a hundred."""
 SETTLED = 1e-4
-"""Metres: it is done when x and y change by less, and the heading by less than a tenth of it in radians."""
+"""Converged when x and y change by less (metres) and the heading by less than a tenth of it (radians)."""
 NORMAL_FROM_MEDIAN = 1.4826
-"""Standard deviation of a normal distribution over the median of its absolute values."""
+"""Standard deviation of a normal distribution divided by the median of its absolute values."""
 DAMPING = 1e-6
-"""Beside a mean information of 1; damping keeps unconstrained directions from diverging."""
+"""Added to the mean information of the pairs; damping keeps unconstrained directions from diverging."""
 
 
 class Table(NamedTuple):
@@ -35,6 +36,13 @@ class Table(NamedTuple):
             bin.
         starts: (BINS + 1,) index of the first entry of each bin of bearings, and M at the end.
         centre: (2,) metres in the map's frame.
+
+    Example:
+        >>> cells = np.array([[0.0, 3.0, 0.0, -1.0, 1.0, 0.0], [3.0, 0.0, -1.0, 0.0, 1.0, 0.0]])
+        >>> table = build_table(cells, 0.0, np.array([1.0, 0.0]), farthest=50.0)
+        >>> table.entries + 0.0  # seen from (1, 0), with the smaller bearing first
+        array([[ 2.,  0., -1.,  0.],
+               [-1.,  3.,  0., -1.]])
     """
 
     entries: FloatArray
@@ -46,7 +54,12 @@ class Table(NamedTuple):
 def bearing_bin(x, y):  # type: ignore[no-untyped-def]
     """The bin of a direction. Bins are sorted by bearing, and each is at least 4 / BINS radians wide.
 
-    The rank is y / (|x| + |y|), unfolded to -2 ... 2 round the circle; it grows by 0.5 to 1 per radian.
+    The rank of a direction is y / (|x| + |y|), continued to -2 ... 2 around the circle. It grows by 0.5 to 1
+    per radian and needs no arctangent.
+
+    Example:
+        >>> bearing_bin(0.0, -1.0), bearing_bin(1.0, 0.0), bearing_bin(0.0, 1.0)  # right, ahead, left
+        (256, 512, 768)
     """
     total = abs(x) + abs(y)
     if total == 0.0:
@@ -59,7 +72,7 @@ def bearing_bin(x, y):  # type: ignore[no-untyped-def]
 
 @compiled
 def _fill_table(cells, since, centre, farthest, entries, starts):  # type: ignore[no-untyped-def]
-    """Fills in the entries and starts of :class:`Table`; returns the number of entries."""
+    """Writes ``entries`` and ``starts`` of a :class:`Table`; returns the number of entries."""
     bins = np.empty(len(cells), np.int32)
     starts[:] = 0
     for i in range(len(cells)):
@@ -82,13 +95,20 @@ def _fill_table(cells, since, centre, farthest, entries, starts):  # type: ignor
 
 
 def build_table(cells: FloatArray, since: float, centre: FloatArray, farthest: float) -> Table:
-    """The cells of a map that can be seen from a place.
+    """The cells of a map that are visible from a position.
 
     Args:
-        cells: (C, 6) of :meth:`rcnn_odom.matching.local_map.LocalMap.present`.
-        since: metres of the way; cells that were last seen before are left out.
-        centre: (2,) metres in the map's frame, near the laser. Cells that turn their back to it are left out.
-        farthest: metres from the centre; cells beyond are left out.
+        cells: (C, 6) as returned by :meth:`rcnn_odom.matching.local_map.LocalMap.present`.
+        since: metres travelled; cells that were last seen earlier are left out.
+        centre: (2,) metres in the map's frame, near the laser. Cells that face away from it are left out.
+        farthest: metres from the centre; cells that are farther away are left out.
+
+    Example:
+        Two walls with normals along -x: the one ahead faces the laser, the one behind faces away.
+
+        >>> cells = np.array([[2.0, 0.0, -1.0, 0.0, 1.0, 0.0], [-2.0, 0.0, -1.0, 0.0, 1.0, 0.0]])
+        >>> build_table(cells, since=0.0, centre=np.zeros(2), farthest=50.0).entries
+        array([[ 2.,  0., -1.,  0.]])
     """
     entries, starts = np.empty((len(cells), 4)), np.empty(BINS + 1, np.int64)
     count = _fill_table(cells, since, centre, farthest, entries, starts)
@@ -97,20 +117,28 @@ def build_table(cells: FloatArray, since: float, centre: FloatArray, farthest: f
 
 @compiled
 def nearest(entries, starts, x, y, nx, ny, gate, same):  # type: ignore[no-untyped-def]
-    """The entry nearest to a point among those whose normals agree with its normal.
+    """The entry nearest to a point among those with a similar normal.
 
-    The search walks outwards from the point's bin. It stops where everything in a bin's direction is farther
-    away than the best entry so far.
+    The search begins in the bin of the point and continues on both sides. It stops when all points in the
+    direction of the next bin are farther away than the best entry so far.
 
     Args:
         entries, starts: of a :class:`Table`.
         x, y: metres from the table's centre.
-        nx, ny: the point's normal.
-        gate: metres.
-        same: least cosine between normals.
+        nx, ny: normal of the point.
+        gate: largest distance in metres.
+        same: least cosine between the normals.
 
     Returns:
-        Its index; -1 where none is nearer than the gate.
+        The index of the entry; -1 if none is within the gate.
+
+    Example:
+        >>> cells = np.array([[2.0, -1.0, -1.0, 0.0, 1.0, 0.0], [2.0, 1.0, -1.0, 0.0, 1.0, 0.0]])
+        >>> entries, starts, _ = build_table(cells, 0.0, np.zeros(2), 50.0)
+        >>> nearest(entries, starts, 2.1, 0.8, -1.0, 0.0, 0.5, 0.7)  # the second entry, 0.22 m away
+        1
+        >>> nearest(entries, starts, 2.1, 0.8, 0.0, 1.0, 0.5, 0.7)  # the normals differ by 90 degrees
+        -1
     """
     home = bearing_bin(x, y)
     best, found = gate * gate, -1
@@ -135,29 +163,42 @@ def nearest(entries, starts, x, y, nx, ny, gate, same):  # type: ignore[no-untyp
 def align(  # type: ignore[no-untyped-def]
     points, normals, entries, starts, centre, start, guess, stiffness, gate, sparse, lines, settings, found
 ):
-    """Moves a scan onto the map.
+    """The pose at which the points of a scan lie on the lines of the map.
 
     Args:
         points, normals: (K, 2) of the scan, metres and unit vectors in the laser's frame.
         entries, starts, centre: of a :class:`Table`.
         start: (3,) pose in the map's frame to begin from, metres and radians.
-        guess: (3,) pose to which a prior pulls.
-        stiffness: (3, 3) of that pull, beside the mean information of the pairs.
-        gate: metres between partners in the first step.
-        sparse: radians; times its range it is added to the gate of a point, since the beams that hit far
-            walls are far apart.
-        lines: so many of the points, the first ones, count for the second score.
-        settings: (6,) metres of the closest gate, the factor by which the gate shrinks in each step, the
-            least cosine between normals of partners, the least scale of the weights as a part of the gate,
-            the largest number of steps, and the residual in metres that scores nothing.
-        found: (7, 3), is filled in. Rows 0 to 2: the information (3, 3) on x, y and heading, a mean over the
-            pairs. Rows 3 to 5: the information that the errors of normals feign, for errors of 1 radian.
-            Row 6: the sum of the weights, the weighted mean square of the residuals in square metres, and the
-            share of points with a partner.
+        guess: (3,) mean of the prior of the pose.
+        stiffness: (3, 3) information of the prior, relative to the mean information of the pairs.
+        gate: largest distance in metres between partners in the first step.
+        sparse: radians; multiplied by the range of a point it is added to its gate, because beams that hit
+            far walls are far apart.
+        lines: number of points, from the first one on, that count for the second score.
+        settings: (6,) the smallest gate in metres, the factor by which the gate shrinks in each step, the
+            least cosine between the normals of partners, the least scale of the weights as a fraction of the
+            gate, the largest number of steps, and the residual in metres with a score of 0.
+        found: (7, 3), written by the function. Rows 0 to 2: the information (3, 3) on x, y and heading, a
+            mean over the pairs. Rows 3 to 5: the spurious part of it from errors of the normals, for errors
+            of 1 radian. Row 6: the sum of the weights, the weighted mean square of the residuals in square
+            metres, and the share of points with a partner.
 
     Returns:
-        The pose (3,), and two scores from 0 to 1, of all points and of those on lines: the mean of one minus
-        the square of residual over width, but 0 for points with a larger residual or without a partner.
+        The pose (3,) and two scores from 0 to 1, of all points and of those on lines: the mean of one minus
+        the squared ratio of residual and width, or 0 for points with a larger residual or without a partner.
+
+    Example:
+        Two walls, 2 m ahead and 2 m to the left, seen from 0.1 m ahead of the centre and 0.2 m left of it:
+
+        >>> from rcnn_odom.matching.registration import SETTINGS
+        >>> places, normals = np.linspace(-1.0, 1.0, 9), np.repeat([[-1.0, 0.0], [0.0, -1.0]], 9, axis=0)
+        >>> points = np.array([[2.0, y] for y in places] + [[x, 2.0] for x in places])
+        >>> table = build_table(np.hstack([points, normals, np.zeros((18, 2))]), 0.0, np.zeros(2), 50.0)
+        >>> prior = np.zeros(3), np.zeros(3), np.zeros((3, 3))  # start and guess; no stiffness
+        >>> options = 1.0, 0.0, 18, SETTINGS, np.empty((7, 3))  # gate, sparse, lines, settings, found
+        >>> pose, *scores = align(points - [0.1, 0.2], normals, *table, *prior, *options)
+        >>> pose.round(3) + 0.0
+        array([0.1, 0.2, 0. ])
     """
     closest, shrink, same, calm, most_steps, width = settings
     n, pose = len(points), start.copy()
@@ -180,22 +221,23 @@ def align(  # type: ignore[no-untyped-def]
         if gate == closest and settled:
             break
         gate = max(closest, shrink * gate)
-    of_lines = _score(partners[:lines], residuals[:lines], width)
-    return pose, _score(partners, residuals, width), of_lines
+    line_score = _score(partners[:lines], residuals[:lines], width)
+    return pose, _score(partners, residuals, width), line_score
 
 
 @compiled
 def _pair(  # type: ignore[no-untyped-def]
     points, normals, entries, starts, centre, pose, turn, limits, residuals, sizes, partners
 ):
-    """Looks for the partners of the points.
+    """Finds the partners of the points, the nearest entries of the map.
 
     Args:
         points, normals, entries, starts, centre, pose: as in :func:`align`.
         turn: cosine and sine of the pose's heading.
-        limits: n, for a partner of every n-th point; and gate, sparse and same as in :func:`align`.
-        residuals, partners: (K,), are filled in for these points: metres, and entries or -1.
-        sizes: (K,), its first places are filled with the absolute residuals of the pairs.
+        limits: the stride n, so that every n-th point is used; gate and sparse as in :func:`align`; and the
+            least cosine between normals.
+        residuals, partners: (K,), written for these points: metres, and the index of the entry or -1.
+        sizes: (K,), its first elements are set to the absolute residuals of the pairs.
 
     Returns:
         The number of pairs.
@@ -220,6 +262,7 @@ def _pair(  # type: ignore[no-untyped-def]
 
 @compiled
 def _score(partners, residuals, width):  # type: ignore[no-untyped-def]
+    """The score of points with these partners (K,) and residuals (K,), as in :func:`align`."""
     score = 0.0
     for i in range(len(partners)):
         if partners[i] >= 0:
@@ -229,10 +272,10 @@ def _score(partners, residuals, width):  # type: ignore[no-untyped-def]
 
 @compiled
 def _sum_up(points, entries, partners, residuals, stride, turn, scale, found):  # type: ignore[no-untyped-def]
-    """Fills in ``found`` of :func:`align` but for the share.
+    """Writes ``found`` of :func:`align` except for the share of points with a partner.
 
     Returns:
-        The gradient (3,) of half the mean square.
+        The gradient (3,) of half the weighted mean square of the residuals.
     """
     across, along = np.zeros((3, 3)), np.zeros((3, 3))
     cos, sin = turn
@@ -271,7 +314,7 @@ def _sum_up(points, entries, partners, residuals, stride, turn, scale, found):  
 
 @compiled
 def _solve_damped(a, b):  # type: ignore[no-untyped-def]
-    """The solution (3,) of a symmetric positive definite system, by Cholesky; ``DAMPING`` is added to it."""
+    """:func:`solve3` after ``DAMPING`` has been added to the diagonal of ``a`` in place."""
     for k in range(3):
         a[k, k] += DAMPING
     return solve3(a, b)
@@ -279,7 +322,12 @@ def _solve_damped(a, b):  # type: ignore[no-untyped-def]
 
 @compiled
 def solve3(a, b):  # type: ignore[no-untyped-def]
-    """The solution (3,) of a symmetric positive definite system, by Cholesky."""
+    """The solution (3,) of a symmetric positive definite system by the Cholesky decomposition.
+
+    Example:
+        >>> solve3(np.diag([1.0, 2.0, 4.0]), np.array([1.0, 4.0, 2.0]))
+        array([1. , 2. , 0.5])
+    """
     l00 = np.sqrt(a[0, 0])
     l10, l20 = a[1, 0] / l00, a[2, 0] / l00
     l11 = np.sqrt(max(a[1, 1] - l10 * l10, 1e-300))

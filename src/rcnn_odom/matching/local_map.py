@@ -1,4 +1,4 @@
-"""What the laser has seen lately: voxels, each with the mean point and normal of what fell into it."""
+"""The local map: voxels, each with the mean point and the mean normal of the points in it."""
 
 import numpy as np
 
@@ -6,19 +6,30 @@ from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 SLOTS = 1 << 16
-"""Places in the hash table, a power of two."""
+"""Slots of the hash table, a power of two."""
 MOST_CELLS = 20_000
-"""Beyond them nothing is added until the map has forgotten something. Usual maps are far smaller."""
+"""A map with so many cells takes no new ones until some are forgotten. Usual maps are far smaller."""
 
 
 class LocalMap:
-    """Points with normals in a fixed frame, averaged in voxels, and forgotten after some metres of the way.
+    """Points with normals in a fixed frame, averaged in voxels and forgotten after some distance.
 
-    A voxel has a cell for each of four directions of normals, so that both sides of a thin wall stay apart.
+    A voxel has one cell for each of four directions of normals, so that both sides of a thin wall stay apart.
 
     Args:
-        voxel: metres.
-        most_weight: points after which a cell's mean follows new points by a constant share.
+        voxel: edge length in metres.
+        most_weight: number of points from which on a new point changes the mean by a constant share.
+
+    Example:
+        Two points of a wall fall into one cell, which becomes their mean with weight 2:
+
+        >>> grid, normals = LocalMap(voxel=0.1, most_weight=10.0), np.array([[-1.0, 0.0], [-1.0, 0.0]])
+        >>> grid.add(np.array([[2.02, 0.05], [2.04, 0.05]]), normals, pose=np.zeros(3), travelled=0.0)
+        >>> grid.present().round(3) + 0.0
+        array([[ 2.03,  0.05, -1.  ,  0.  ,  2.  ,  0.  ]])
+        >>> grid.forget(before=5.0)  # the laser has moved on; this wall was last seen at 0 m
+        >>> len(grid.present())
+        0
     """
 
     def __init__(self, voxel: float, most_weight: float) -> None:
@@ -29,17 +40,25 @@ class LocalMap:
         self.count = 0
 
     def clear(self) -> None:
-        """Forgets everything."""
+        """Removes all cells.
+
+        Example:
+            >>> grid = LocalMap(voxel=0.1, most_weight=10.0)
+            >>> grid.add(np.ones((1, 2)), np.array([[-1.0, 0.0]]), pose=np.zeros(3), travelled=0.0)
+            >>> grid.clear()
+            >>> len(grid.present())
+            0
+        """
         self.slots[:] = -1
         self.count = 0
 
     def add(self, points: FloatArray, normals: FloatArray, pose: FloatArray, travelled: float) -> None:
-        """Adds what was seen from a pose.
+        """Adds points that were seen from a pose.
 
         Args:
             points, normals: (P, 2) metres and unit vectors in the laser's frame.
             pose: (3,) metres and radians in the map's frame.
-            travelled: metres of the way to there.
+            travelled: metres travelled to that pose.
         """
         self.count = _add(
             points,
@@ -55,24 +74,24 @@ class LocalMap:
         )
 
     def present(self) -> FloatArray:
-        """Its cells (C, 6): x and y in metres, normal, weight, and the metres of the way when last seen."""
+        """The cells (C, 6): x and y in metres, normal, weight, and metres travelled when last seen."""
         return self.cells[: self.count]
 
     def forget(self, before: float) -> None:
-        """Removes what was last seen before so many metres of the way."""
+        """Removes the cells that were last seen before so many metres travelled."""
         self.count = _forget(before, self.cells, self.keys, self.slots, self.count)
 
 
 @compiled
 def _key(column, row, nx, ny):  # type: ignore[no-untyped-def]
-    """The number of a cell: 29 bits for each index of the voxel, and two for the direction of the normal."""
+    """The key of a cell: 29 bits for each index of the voxel and two for the direction of the normal."""
     side = (nx <= 0) if abs(nx) > abs(ny) else 2 + (ny <= 0)
     return (((column & 0x1FFFFFFF) << 29 | (row & 0x1FFFFFFF)) << 2) | side
 
 
 @compiled
 def _slot(key, slots, keys):  # type: ignore[no-untyped-def]
-    """Where a key is in the table, or the free slot where it belongs."""
+    """The slot of a key in the hash table, or the free slot where it belongs."""
     mixed = key * np.int64(-7046029254386353131)
     place = (mixed >> 40) & (SLOTS - 1)
     while slots[place] >= 0 and keys[slots[place]] != key:
@@ -119,7 +138,7 @@ def _add(  # type: ignore[no-untyped-def]
 
 @compiled
 def _forget(before, cells, keys, slots, count):  # type: ignore[no-untyped-def]
-    """Moves the cells that stay to the front, and builds the hash table anew; returns their number."""
+    """Moves the remaining cells to the front and rebuilds the hash table; returns their number."""
     slots[:] = -1
     kept = 0
     for cell in range(count):

@@ -1,4 +1,4 @@
-"""Which readings mean that nothing came back: many lasers write one and the same large number."""
+"""Detects which ranges mean "no return": many lasers report the same large number for it."""
 
 import numpy as np
 
@@ -6,30 +6,39 @@ from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 TOP = 0.994
-"""Part of the largest reading from which on readings may be that number: some lasers vary it by half a
+"""Ranges of at least this fraction of the largest range may be that number, which some lasers vary by half a
 percent."""
 BELOW = 0.97
-"""Part of the largest reading down to which readings are compared with those at the top."""
+"""Ranges between this fraction and ``TOP`` of the largest range are counted for comparison."""
 FEWEST, TIMES = 5, 3
-"""Readings at the top are no walls if there are so many, and so many times as many as just below."""
+"""The largest ranges are no walls if there are at least ``FEWEST`` of them, and at least ``TIMES`` as many as
+just below."""
 LEAST = 3.5
-"""Metres: no laser's maximum is smaller, and in a small round room all readings are the largest."""
+"""Metres: the number is never smaller. In a small round room all ranges are near the largest one."""
 
 
 class NoReturn:
-    """Learns from the readings of one laser what it writes where nothing came back."""
+    """Learns from the ranges of one laser which number it reports where nothing came back.
+
+    Example:
+        A laser that sees walls up to 5 m away and reports 8 m where nothing came back:
+
+        >>> ranges = np.concatenate([np.linspace(1.0, 5.0, 90), np.full(20, 8.0)])
+        >>> round(NoReturn().limit(ranges, farthest=120.0), 3)  # half a percent below 8 m
+        7.952
+    """
 
     def __init__(self) -> None:
-        self._state = np.zeros(3)  # the largest reading, and how many were at the top and just below
+        self._state = np.zeros(3)  # the largest range, and the numbers of ranges at the top and just below
 
     def limit(self, ranges: FloatArray, farthest: float) -> float:
-        """Metres at or beyond which a reading of this scan (P,) is no return, at most ``farthest``."""
+        """Metres; a range of this scan (P,) of at least that is no return. It is at most ``farthest``."""
         return min(farthest, _learn(ranges, farthest, self._state))
 
 
 @compiled
 def _learn(ranges, farthest, state):  # type: ignore[no-untyped-def]
-    """Counts the readings of a scan; returns the limit in metres, inf if there is none yet."""
+    """Counts the ranges of a scan in ``state``; returns the limit in metres, inf if none is known yet."""
     largest = state[0]
     for i in range(len(ranges)):
         if ranges[i] > largest and ranges[i] < farthest:

@@ -1,4 +1,4 @@
-"""A scan as the matcher sees it: points, each with the normal of the line on which it lies."""
+"""The outline of a scan, the input of the matcher: points, each with the normal of the line through it."""
 
 from dataclasses import dataclass
 
@@ -8,31 +8,30 @@ from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray
 
 LINE_REACH, LINE_GAP = 0.2, 0.2
-"""Metres from a point to the neighbours to which its line is fitted, and between two neighbours: a wider gap
-is a jump from one thing to another behind it."""
+"""Metres from a point to the neighbours to which its line is fitted, and between two neighbours. A wider gap
+is a jump to an object behind."""
 SPARSE_REACH, SPARSE_GAP = 4.0, 8.0
-"""The same for far points, in distances between neighbours on a wall that is seen squarely; to be added."""
+"""Added for far points: multiples of the distance between neighbours on a wall that faces the laser."""
 CLOSED = 8.0
-"""Spacings of the beams between the last point and the first, up to which a scan covers the whole circle."""
+"""A scan covers the whole circle if its last and first point are less than so many beam spacings apart."""
 OVERLAP = 50
-"""Points that are repeated at each end of a whole circle, so that lines cross the seam."""
+"""Points that are repeated at both ends of a full circle, so that lines continue across the ends."""
 UNKNOWN_SPACING = 0.1
-"""Radians: for a scan whose points all have the same bearing."""
+"""Radians, for a scan whose points all have the same bearing."""
 SMALL = 0.6
-"""Metres across: what stands alone and is smaller is a thing such as a post or a trunk."""
+"""Metres: an isolated object that is narrower is used as a whole, such as a post or a trunk."""
 BESIDE = np.deg2rad(3.0)
-"""Radians: a return farther aside is no neighbour."""
+"""Radians; a return at a larger angle is no neighbour."""
 FEW_LINES = 200
-"""Points on lines, from which on things that stand alone are left out, since they are less exact."""
+"""With so many points on lines, isolated objects are left out, because they are less accurate."""
 ENOUGH = 600
-"""Lines in a scan. If there are at least twice as many points, only every second, third ... has its line."""
+"""Lines per scan. With n times as many points (n = 2, 3, ...) a line is fitted to every n-th point only."""
 FEWEST_ON_LINE = 3
-"""Points to which a line is fitted at least."""
+"""Minimum number of points for a line."""
 STRAIGHT = 0.1
-"""Variance across a line divided by the variance along it, above which neighbours are no line."""
+"""Neighbours are no line if their variance across it, divided by the variance along it, is larger."""
 TYPICAL = 0.7
-"""Share of the lines whose returns scatter less than what counts as usual: there are fewer rough things than
-walls."""
+"""Quantile of the scatter of lines that counts as typical: there are fewer rough objects than walls."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,16 +39,23 @@ class Outline:
     """The points of a scan that lie on lines.
 
     Attributes:
-        points: (P, 2) metres, x forward, y left, moved onto their lines, in angular order. Where there are
-            few, things that stand alone follow, each twice.
-        normals: (P, 2) of the lines, unit length, towards the laser. Of a thing that stands alone the first
-            normal points towards the laser and the second across.
-        returns: (R, 2) metres: all points of the scan, on lines or not.
-        lines: how many of the points lie on lines; those of things that stand alone come after them.
-        scatter: square metres, the usual mean square distance of returns from their line.
-        normal_noise: square radians, the mean square error of the normals that follows from the scatter.
+        points: (P, 2) metres, x forward, y left, projected on their lines, in angular order. If there are
+            few, isolated objects follow, each as two equal points.
+        normals: (P, 2) unit normals of the lines, towards the laser. An isolated object has one normal
+            towards the laser and one across.
+        returns: (R, 2) metres, all points of the scan, on lines or not.
+        lines: number of the points that lie on lines; the points of isolated objects come after them.
+        scatter: typical mean square distance of returns from their line, in square metres.
+        normal_noise: mean square error of the normals that results from the scatter, in square radians.
         reach: median range of the points on lines in metres.
         spacing: median angle between neighbouring returns in radians.
+
+    Example:
+        A post 5 m ahead is one return on no line. It becomes two points, with normals back and across:
+
+        >>> post = outline(np.array([[5.0, 0.0, 0.0]]))
+        >>> post.lines, post.points.tolist(), (post.normals + 0.0).tolist()
+        (0, [[5.0, 0.0], [5.0, 0.0]], [[-1.0, 0.0], [0.0, 1.0]])
     """
 
     points: FloatArray
@@ -63,31 +69,40 @@ class Outline:
 
 
 def outline(found: FloatArray) -> Outline:
-    """Fits a line to the neighbours of every point.
+    """The outline of a scan: a line is fitted to the neighbours of every point.
 
     Args:
-        found: (R, 3) of :func:`rcnn_odom.matching.points.find_points`.
+        found: (R, 3) points as returned by :func:`rcnn_odom.matching.points.find_points`.
+
+    Example:
+        A straight wall 2 m ahead: all its points have x = 2 m and a normal that points back to the laser.
+
+        >>> bearings = np.deg2rad(np.arange(-45.0, 46.0))
+        >>> x, y = np.full(91, 2.0), 2.0 * np.tan(bearings)
+        >>> wall = outline(np.stack([x, y, bearings], axis=1))
+        >>> wall.lines, np.unique(wall.points[:, 0].round(6)), np.unique(wall.normals.round(6) + 0.0, axis=0)
+        (91, array([2.]), array([[-1.,  0.]]))
     """
     points, normals = np.empty((3 * len(found), 2)), np.empty((3 * len(found), 2))
-    count, *about = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0, 0.0)
+    count, *statistics = _fit_lines(found, points, normals) if len(found) > 2 else (0, 0.0, 0.0, 0.0, 0.0)
     lines = count
     if lines < FEW_LINES:
-        count = _add_things(found, points, normals, lines)
+        count = _add_isolated(found, points, normals, lines)
     if not lines and count:
-        about[2] = float(np.median(np.hypot(*points[:count].T)))
-    return Outline(points[:count], normals[:count], found[:, :2], lines, *about)
+        statistics[2] = float(np.median(np.hypot(*points[:count].T)))
+    return Outline(points[:count], normals[:count], found[:, :2], lines, *statistics)
 
 
 @compiled
 def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
-    """Fills in points on lines and their normals.
+    """Writes the points on lines and their normals to ``points`` and ``normals``.
 
     Returns:
-        Their number, and scatter, noise of normals, reach and spacing as in :class:`Outline`.
+        Their number; scatter, noise of the normals, reach and spacing as in :class:`Outline`.
     """
     n = len(found)
     spacing = _median_spacing(found)
-    # The circle is closed by repeating points at both ends.
+    # A full circle is closed by repeating points at both ends.
     closed = found[0, 2] + 2 * np.pi - found[n - 1, 2] < CLOSED * spacing
     extra = min(OVERLAP, n // 2) if closed else 0
     xy, radius = _unroll(found, extra)
@@ -110,7 +125,7 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
         points[count, 0], points[count, 1] = xy[i, 0] - off * nx, xy[i, 1] - off * ny
         normals[count, 0], normals[count, 1] = nx, ny
         scatter[count], ranges[count] = max(across, 0.0), radius[i]
-        # The variance of the direction of a line through m points.
+        # The variance of the direction of a line fitted to m points.
         noise += across / (m * along)
         count += 1
     if count == 0:
@@ -122,7 +137,7 @@ def _fit_lines(found, points, normals):  # type: ignore[no-untyped-def]
 
 @compiled
 def _median_spacing(found):  # type: ignore[no-untyped-def]
-    """Median angle between neighbours in radians."""
+    """Median angle between neighbouring points in radians."""
     steps, apart = np.empty(len(found)), 0
     for i in range(1, len(found)):
         if found[i, 2] - found[i - 1, 2] > 1e-9:
@@ -133,7 +148,7 @@ def _median_spacing(found):  # type: ignore[no-untyped-def]
 
 @compiled
 def _unroll(found, extra):  # type: ignore[no-untyped-def]
-    """Points (T, 2) with so many repeated at both ends of the circle, and their ranges (T,)."""
+    """Points (T, 2), of which ``extra`` are repeated at each end of the circle, and their ranges (T,)."""
     n = len(found)
     xy = np.empty((n + 2 * extra, 2))
     for i in range(len(xy)):
@@ -143,7 +158,7 @@ def _unroll(found, extra):  # type: ignore[no-untyped-def]
 
 @compiled
 def _connected(xy, radius, spacing):  # type: ignore[no-untyped-def]
-    """The first and the last point (T,), (T,) of the run without a jump to which each point belongs."""
+    """For each point the first (T,) and the last (T,) point of its run of points without a jump."""
     total = len(xy)
     first, last = np.empty(total, np.int64), np.empty(total, np.int64)
     first[0], last[total - 1] = 0, total - 1
@@ -158,7 +173,7 @@ def _connected(xy, radius, spacing):  # type: ignore[no-untyped-def]
 
 @compiled
 def _running_sums(xy):  # type: ignore[no-untyped-def]
-    """Sums (T + 1, 5) of x, y, xx, xy and yy over the points before each."""
+    """Cumulative sums (T + 1, 5) of x, y, xx, xy and yy, each over all earlier points."""
     sums = np.zeros((len(xy) + 1, 5))
     for i in range(len(xy)):
         x, y = xy[i, 0], xy[i, 1]
@@ -170,14 +185,14 @@ def _running_sums(xy):  # type: ignore[no-untyped-def]
 
 @compiled
 def _neighbours(xy, i, reach, first, last, low, high):  # type: ignore[no-untyped-def]
-    """The first and the last neighbour of a point, moved on from those of the point before.
+    """The first and the last neighbour of a point, found from those of the previous point.
 
     Args:
         xy: (T, 2) metres.
-        i: the point.
-        reach: square metres.
+        i: index of the point.
+        reach: square of the largest distance, in square metres.
         first, last: the run of connected points to which it belongs.
-        low, high: of the point before.
+        low, high: the result for the previous point.
     """
     low, high = max(low, first), min(max(high, i), last)
     while low < i and _square(xy, low, i) > reach:
@@ -193,13 +208,13 @@ def _neighbours(xy, i, reach, first, last, low, high):  # type: ignore[no-untype
 
 @compiled
 def _square(xy, i, j):  # type: ignore[no-untyped-def]
-    """Square of the distance between two points."""
+    """The squared distance between two points."""
     return (xy[i, 0] - xy[j, 0]) ** 2 + (xy[i, 1] - xy[j, 1]) ** 2
 
 
 @compiled
 def _fit_line(sums, low, high):  # type: ignore[no-untyped-def]
-    """The line through some points: their mean, its normal, and the variances across and along it."""
+    """The line through points low to high: their mean, its normal, and the variances across and along it."""
     m = high + 1 - low
     x, y = (sums[high + 1, 0] - sums[low, 0]) / m, (sums[high + 1, 1] - sums[low, 1]) / m
     xx = (sums[high + 1, 2] - sums[low, 2]) / m - x * x
@@ -215,10 +230,10 @@ def _fit_line(sums, low, high):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _stands_alone(found, start, stop, radius):  # type: ignore[no-untyped-def]
-    """Whether what lies beside the returns start to stop - 1, so many metres away, is behind them or nothing.
+def _is_isolated(found, start, stop, radius):  # type: ignore[no-untyped-def]
+    """Whether the neighbours of returns start to stop - 1, ``radius`` metres away, are far behind or absent.
 
-    Beams that graze a wall meet it far apart as well, but there one neighbour is nearer than the other.
+    Returns at a grazing angle on a wall are also far apart, but there one of the neighbours is nearer.
     """
     n = len(found)
     for here, beside in ((start, start - 1), (stop - 1, stop)):
@@ -232,17 +247,17 @@ def _stands_alone(found, start, stop, radius):  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _add_things(found, points, normals, count):  # type: ignore[no-untyped-def]
-    """Appends small things that stand alone, as points that are held both ways; returns the new count."""
+def _add_isolated(found, points, normals, count):  # type: ignore[no-untyped-def]
+    """Appends small isolated objects, each with a normal in both directions; returns the new count."""
     n = len(found)
     start = 0
     for i in range(1, n + 1):
         if i < n and (found[i, 0] - found[i - 1, 0]) ** 2 + (found[i, 1] - found[i - 1, 1]) ** 2 < SMALL**2:
             continue
-        wide = (found[i - 1, 0] - found[start, 0]) ** 2 + (found[i - 1, 1] - found[start, 1]) ** 2
+        width = (found[i - 1, 0] - found[start, 0]) ** 2 + (found[i - 1, 1] - found[start, 1]) ** 2
         x, y = np.mean(found[start:i, 0]), np.mean(found[start:i, 1])
         radius = np.sqrt(x * x + y * y)
-        if wide < SMALL**2 and radius > 1e-3 and _stands_alone(found, start, i, radius):
+        if width < SMALL**2 and radius > 1e-3 and _is_isolated(found, start, i, radius):
             for k in range(2):
                 points[count, 0], points[count, 1] = x, y
                 normals[count, 0] = -x / radius if k == 0 else -y / radius

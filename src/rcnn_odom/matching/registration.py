@@ -1,4 +1,4 @@
-"""Where a laser is in the map of what it has seen lately: registration of one scan after the other."""
+"""Registration: the pose of one scan after the other in a local map that is built from them."""
 
 import math
 from dataclasses import dataclass, field
@@ -19,84 +19,94 @@ from rcnn_odom.matching.local_map import LocalMap
 from rcnn_odom.matching.outline import Outline
 
 FEWEST_POINTS = 6
-"""Points without which a scan cannot be registered: three things that stand alone."""
+"""Minimum number of points for registration: those of three isolated objects."""
 MOST_POINTS = 250
-"""Points of a scan that are aligned, every k-th in angular order."""
+"""Points of a scan that are aligned, evenly chosen in angular order."""
 VOXEL, MOST_WEIGHT = 0.1, 10.0
-"""Metres, and points whose mean a cell of the map is; see :class:`LocalMap`."""
+"""Edge length of the map's voxels in metres, and the weight of a cell; see :class:`LocalMap`."""
 MAP_LENGTH, SHORTEST_MAP = 2.0, 1.5
-"""The length of the way that the map remembers, in median ranges of a scan, and at least in metres. A longer
-one would hold on to old errors; a shorter one would lose what has left the field of view."""
+"""Distance travelled after which the map forgets, in median ranges of a scan, and its minimum in metres. A
+longer map keeps old errors; a shorter one loses what has left the field of view."""
 KEY_DISTANCE, KEY_TURN, KEY_SHARE = 0.2, np.deg2rad(10.0), 0.9
-"""A scan is added to the map after so many metres or radians, or when less of it is in the map ..."""
+"""A scan is added to the map after so many metres or radians, or if less than this share is in the map ..."""
 KEY_LEAST = 0.25
-"""... and it is at least this part of the former away. At rest nothing is added, so that nothing drifts."""
+"""... and it is at least this fraction of them away. At rest nothing is added, so that nothing drifts."""
 TABLE_FARTHEST = 120.0
-"""Metres: cells of the map that are farther away are not looked at."""
+"""Metres; cells of the map that are farther away are not used."""
 WIDE_GATE, NARROW_GATE, GATE_ERRORS = 5.0, 1.0, 3.0
-"""Metres between partners in the first step: where the guess may be anywhere, and at least; otherwise it is
-so many of the recent errors of guesses."""
+"""Largest distance between partners in the first step (the gate): metres without a useful guess, metres at
+least, and otherwise this multiple of the recent error of the guesses."""
 GATE_TURN, GATE_FADES = 5.0, 0.9
-"""Metres by which a radian of such an error counts, and by what the largest fades in each scan."""
+"""Metres that equal an error of one radian, and the factor by which the largest error decays in each scan."""
 GOOD_SCORE, LEAST_SCORE = 0.65, 0.25
-"""Below the former other starts are tried as well; below the latter the scan does not fit the map."""
+"""Below the first score, other starts are tried as well; below the second, the scan does not fit the map."""
 ELSEWHERE, ELSEWHERE_TURN, NEARLY = 0.3, np.deg2rad(5.0), 0.85
-"""Metres or radians from which on an alignment is another place, which is a rival with this part of the best
-score."""
+"""An alignment more than so many metres or radians away is another place. It makes the best one ambiguous if
+its score is more than this fraction of the best."""
 SUDDEN, SUDDEN_TURN = 0.5, np.deg2rad(20.0)
-"""Metres or radians from the guess, from which on a motion is told as sudden."""
+"""A motion more than so many metres or radians from the guess is reported as sudden."""
 WEAK_SHIFTS = (0.4, 0.8, 1.2, -0.4, -0.8)
-"""Metres along a direction that is hardly determined, where other starts are tried."""
+"""Metres along a hardly determined direction at which other starts are tried."""
 START_PENALTY, AWAY_PENALTY, TURN_PENALTY = 0.03, 0.03, 0.06
-"""Of the score: for another start than the guess, and for a metre and a radian from it."""
+"""Deductions from the score: for a start other than the guess, per metre and per radian from the guess."""
 CLOSEST_GATE, GATE_SHRINKS = 0.25, 0.5
-"""Metres where the gate stops, and by what it shrinks in each step."""
+"""The smallest gate in metres, and the factor by which the gate shrinks in each step."""
 SPARSE_GATE = 4.0
-"""Spacings of the beams by which the gate of a point opens with its range."""
+"""Increase of a point's gate with its range, in beam spacings."""
 SAME_WALL = np.cos(np.deg2rad(45.0))
-"""Cosine between two normals, below which a pair shows two different walls."""
+"""Least cosine between the normals of a pair; below it they belong to different walls."""
 CALM = 0.04
-"""Times the gate: residuals of this size keep their weight even where most are smaller. A centimetre at last;
-while the gate is open the few walls across a street must pull as well as the many along it."""
+"""Least scale of the robust weights as a fraction of the gate, one centimetre at the smallest gate. While the
+gate is wide, the few walls across a street must count as much as the many along it."""
 MOST_STEPS = 30
+"""Largest number of Gauss-Newton steps."""
 ENOUGH_LINES = 60
-"""Points on lines, from which on these alone tell whether a scan fits."""
+"""With so many points on lines, only these decide whether a scan fits."""
 SCORE_WIDTH = 0.15
-"""Metres of a residual that counts for nothing in the score."""
+"""Metres; points with a larger residual have a score of 0."""
 SETTINGS = np.array([CLOSEST_GATE, GATE_SHRINKS, SAME_WALL, CALM, MOST_STEPS, SCORE_WIDTH])
+"""Settings of :func:`rcnn_odom.matching.align.align`."""
 WEAK_PRIOR = 5e-4 * np.eye(3)
-"""Pull to the guess, beside a mean square of 1 of residuals' change over metres or radians."""
+"""Information of a guess that was not measured, relative to the mean information of the pairs."""
 POINT_ERROR = 0.01
-"""Metres of a usual point's error, against which a measured guess is weighed."""
+"""Metres: the error of a typical point, by which a measured guess is weighted."""
 TURNS, FEWEST_FOR_TURNS = 5, 30
-"""Peaks of the correlation of normals that are tried as turns, and points that tell of them."""
+"""Number of turns that are tried from the correlation of normals, and the points that it needs."""
 NEAR_GATE = 1.5
-"""Metres of the gate where another start is thought to be near."""
+"""Gate in metres for other starts that are near the guess."""
 SHIFTS = (0.5, 1.0, 1.5, 2.0, 3.0)
-"""Metres straight ahead of where the laser was, where other starts are tried."""
+"""Metres straight ahead of the last pose at which other starts are tried."""
 FIRST_SHIFTS = (0.75, 1.5, 3.0, 4.5, -0.75, -1.5)
-"""Metres ahead that are tried as well while the motion is not known yet."""
+"""The same while no motion is known yet."""
 FORGET_EVERY = 10
-"""Scans after which the map drops what it has forgotten."""
+"""Number of scans added to the map between two removals of old cells."""
 MOST_LOST = 5
-"""Scans in a row that do not fit the map, after which a new map begins."""
+"""A new map begins after more than so many scans in a row that do not fit."""
 
 
 @dataclass(frozen=True, eq=False)
 class Match:
-    """Where a scan was taken.
+    """The pose of a scan in the map.
 
     Attributes:
         pose: (3,) x and y in metres and heading in radians in the map's frame.
-        step: (3, 3) covariance of the step from the pose before, in that one's frame.
-        noise: (3, 3) covariance of the part of its error that the next step takes back, in the pose's frame.
+        step: (3, 3) covariance of the step from the previous pose, in the frame of that pose.
+        noise: (3, 3) covariance of the part of its error that the next step cancels, in the pose's frame.
         held: (3, K) directions in the map's frame, of unit length in metres and radians, which the scan does
-            not determine: along them the pose is the guess.
-        fits: the scan fits the map; otherwise the pose is the guess.
-        is_poor: much of it does not fit.
-        is_ambiguous: it fits in another place nearly as well.
-        surprise: metres and radians from where the guess led, if that is far; otherwise 0.
-        begins_map: nothing has fitted for a while, and a new map begins with this scan.
+            not determine; along them the pose is the guess.
+        fits: whether the scan fits the map; otherwise the pose is the guess.
+        is_poor: much of the scan does not fit.
+        is_ambiguous: the scan fits in another place nearly as well.
+        surprise: metres and radians between the pose and the guess if that is much; otherwise 0.
+        begins_map: several scans did not fit, and a new map begins with this scan.
+
+    Example:
+        A scan without returns fits no map, so that its pose is the guess:
+
+        >>> nothing = Outline(*[np.empty((0, 2))] * 3, 0, 0.0, 0.0, reach=0.0, spacing=0.1)
+        >>> match = Registration().register(nothing, guess=np.array([1.0, 0.0, 0.0]), spread=np.eye(3))
+        >>> match.fits, match.pose.tolist()
+        (False, [1.0, 0.0, 0.0])
     """
 
     pose: FloatArray
@@ -116,7 +126,20 @@ class Registration:
     Attributes:
         pose: (3,) of the last scan in the map's frame, x and y in metres and heading in radians.
         is_empty: there is no map yet.
-        knows_motion: a scan has been registered, so that the next guess has something to go by.
+        knows_motion: a scan has been registered, so that the next guess can be based on a motion.
+
+    Example:
+        A square room of 8 m, seen from its centre and then from 1 m ahead:
+
+        >>> from rcnn_odom.matching.outline import outline
+        >>> from rcnn_odom.matching.points import find_points
+        >>> bearings, registration = np.deg2rad(np.arange(0.5, 360.0)), Registration()
+        >>> cos, sin = np.cos(bearings), np.abs(np.sin(bearings))
+        >>> room = [np.minimum((4 - x * np.sign(cos)) / np.abs(cos), 4 / sin) for x in (0.0, 1.0)]
+        >>> first, second = [outline(find_points(ranges, bearings, 80.0)) for ranges in room]
+        >>> registration.begin(first)
+        >>> registration.register(second, guess=np.zeros(3), spread=np.eye(3)).pose.round(2) + 0.0
+        array([1., 0., 0.])
     """
 
     def __init__(self) -> None:
@@ -127,8 +150,22 @@ class Registration:
         self._table: Table
         self._guess_error, self._uncertainty = np.inf, Uncertainty()
 
+    def map_points(self) -> FloatArray:
+        """The points (C, 2) in metres in the map's frame with which the next scan is compared.
+
+        Example:
+            >>> wall, normals = np.array([[2.0, y] for y in range(6)]), np.repeat([[-1.0, 0.0]], 6, axis=0)
+            >>> registration = Registration()
+            >>> registration.begin(Outline(wall, normals, wall, 6, 0.0, 0.0, reach=2.0, spacing=0.01))
+            >>> registration.map_points()[:2]
+            array([[2., 0.],
+                   [2., 1.]])
+        """
+        cells = self._map.present()
+        return cells[cells[:, 5] >= self._since, :2]
+
     def begin(self, scan: Outline) -> None:
-        """Begins a new map with a scan at the present pose."""
+        """Begins a new map with a scan at the current pose."""
         self._map.clear()
         self._lost, self._guess_error, self.knows_motion = 0, np.inf, False
         self._uncertainty = Uncertainty()
@@ -144,25 +181,26 @@ class Registration:
 
         Args:
             scan: its points and normals.
-            guess: (3,) pose in the map's frame.
+            guess: (3,) pose in the map's frame, from which the search starts.
             spread: (3, 3) covariance of the guess in the map's frame.
-            pull: (3, 3) covariance of what was measured of it, by which it pulls; None: it pulls weakly.
+            pull: (3, 3) covariance of the guess as a measurement, by which the match is drawn to it. None: it
+                was not measured and has a small weight.
         """
         if len(scan.points) < FEWEST_POINTS or self.is_empty:
-            return self._lose(scan, guess, spread)
+            return self._keep_guess(scan, guess, spread)
         found, has_rival = self._search(
             scan, guess, WEAK_PRIOR if pull is None else _stiffness(pull, len(scan.points))
         )
         if found.fit < LEAST_SCORE:
-            return self._lose(scan, guess, spread)
+            return self._keep_guess(scan, guess, spread)
         pose, held, information = hold_undetermined(found, guess, spread)
         off = math.hypot(pose[0] - guess[0], pose[1] - guess[1]), abs(_wrap(pose[2] - guess[2]))
         is_sudden = self.knows_motion and (off[0] > SUDDEN or off[1] > SUDDEN_TURN)
         error = off[0] + GATE_TURN * off[1]
-        fading = 0.0 if np.isinf(self._guess_error) else GATE_FADES * self._guess_error
-        self._guess_error, self._lost, self.knows_motion = max(fading, error), 0, True
+        decayed = 0.0 if np.isinf(self._guess_error) else GATE_FADES * self._guess_error
+        self._guess_error, self._lost, self.knows_motion = max(decayed, error), 0, True
         before, self.pose = self.pose, pose
-        if self._is_key(pose, found.share):
+        if self._is_keyframe(pose, found.share):
             self._add(scan)
         covariances = self._uncertainty.update(
             before, pose, spread, information, max(scan.reach, SHORTEST_MAP)
@@ -175,9 +213,12 @@ class Registration:
         )
 
     def _search(self, scan: Outline, guess: FloatArray, stiffness: FloatArray) -> tuple[Aligned, bool]:
-        """The best alignment from the guess on, or where that is poor from others as well; has it a rival?"""
-        points, normals = _thin(scan)
-        # Things that stand alone look different from elsewhere; where there are lines, they alone tell it.
+        """The best alignment, and whether the scan fits elsewhere nearly as well.
+
+        The search starts from the guess, and from other poses as well if that gives a poor result.
+        """
+        points, normals = _subsample(scan)
+        # Isolated objects look different from other positions, so only lines count if there are enough.
         lines = len(points) * scan.lines // len(scan.points) if scan.lines >= ENOUGH_LINES else len(points)
         found = np.zeros((7, 3))
 
@@ -187,7 +228,7 @@ class Registration:
                 *(points, normals, table.entries, table.starts, table.centre),
                 *(start, guess, stiffness, gate, SPARSE_GATE * scan.spacing, lines, SETTINGS, found),
             )
-            return Aligned.of(pose, score, fit, found, scan, len(points))
+            return Aligned.from_alignment(pose, score, fit, found, scan, len(points))
 
         gate = min(WIDE_GATE, max(NARROW_GATE, GATE_ERRORS * self._guess_error))
         best = align_from(guess, gate)
@@ -200,14 +241,14 @@ class Registration:
             return best, False
         found_all = [best, *(align_from(*start) for start in starts)]
         first = best
-        # What is nearer to the guess is preferred, so that a twin must fit better by more than chance.
+        # Poses near the guess are preferred: a similar place must fit better by more than chance.
         best = max(found_all, key=lambda other: other.score - _penalty(other.pose, guess, other is not first))
         return best, any(_is_rival(other, best) for other in found_all)
 
     def _other_starts(self, scan: Outline, guess: FloatArray, gate: float) -> list[tuple[FloatArray, float]]:
-        """Poses where the laser may be as well, with the gates to begin with.
+        """Other poses to start from, each with its first gate.
 
-        By the turn that the normals tell, where it was, or straight ahead of there.
+        They are the last pose, positions straight ahead of it, and turns that are found from the normals.
         """
         starts = [(guess, other) for other in (WIDE_GATE, NEAR_GATE) if other != gate]
         starts.append((self.pose, WIDE_GATE))
@@ -219,10 +260,11 @@ class Registration:
         shifts, gate = (SHIFTS, NEAR_GATE) if self.knows_motion else (FIRST_SHIFTS, WIDE_GATE)
         return starts + [(advance(ahead, np.array([shift, 0.0, 0.0])), gate) for shift in shifts]
 
-    def _lose(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
-        """The guess, for a scan that does not fit the map; after several of them a new map begins there.
+    def _keep_guess(self, scan: Outline, guess: FloatArray, spread: FloatArray) -> Match:
+        """Takes the guess as the pose of a scan that does not fit the map.
 
-        Where there is no map at all, one begins with the first scan that has enough to see.
+        After several of them a new map begins there. Without any map, one begins with the first scan that has
+        enough points.
         """
         self._lost += 1
         covariances = self._uncertainty.update(self.pose, guess, spread, np.zeros((3, 3)))
@@ -232,14 +274,14 @@ class Registration:
             self.begin(scan)
         return Match(guess, *covariances, np.eye(3), fits=False, begins_map=begins)
 
-    def _is_key(self, pose: FloatArray, share: float) -> bool:
-        """Whether a scan adds something to the map."""
+    def _is_keyframe(self, pose: FloatArray, share: float) -> bool:
+        """Whether a scan at this pose, with this share of points in the map, is to be added to the map."""
         step = relative_step(self._key_pose, pose)
         away = max(math.hypot(step[0], step[1]) / KEY_DISTANCE, abs(float(step[2])) / KEY_TURN)
         return away > 1 or (away > KEY_LEAST and share < KEY_SHARE)
 
     def _add(self, scan: Outline) -> None:
-        """Adds a scan at the present pose to the map, which forgets what is too far back."""
+        """Adds a scan at the current pose to the map and forgets what was seen too long ago."""
         step = relative_step(self._key_pose, self.pose)
         self._travelled += math.hypot(step[0], step[1])
         self._map.add(scan.points, scan.normals, self.pose, self._travelled)
@@ -251,8 +293,8 @@ class Registration:
         self._table = build_table(self._map.present(), self._since, self.pose[:2], TABLE_FARTHEST)
 
 
-def _thin(scan: Outline) -> tuple[FloatArray, FloatArray]:
-    """Points and normals (K, 2) of a scan, evenly chosen."""
+def _subsample(scan: Outline) -> tuple[FloatArray, FloatArray]:
+    """At most ``MOST_POINTS`` points (K, 2) and normals (K, 2) of a scan, evenly chosen."""
     if len(scan.points) <= MOST_POINTS:
         return scan.points, scan.normals
     chosen = np.arange(MOST_POINTS) * len(scan.points) // MOST_POINTS
@@ -260,24 +302,24 @@ def _thin(scan: Outline) -> tuple[FloatArray, FloatArray]:
 
 
 def _penalty(pose: FloatArray, guess: FloatArray, is_other: bool) -> float:
-    """Of a score, for what was reached from another start than the guess, or is far from it."""
+    """The deduction from the score of a pose for its distance from the guess and for another start."""
     away = math.hypot(pose[0] - guess[0], pose[1] - guess[1])
     start = START_PENALTY if is_other else 0.0
     return start + AWAY_PENALTY * min(away, 3.0) + TURN_PENALTY * abs(_wrap(pose[2] - guess[2]))
 
 
 def _is_rival(other: Aligned, best: Aligned) -> bool:
-    """Whether another place fits a scan nearly as well as the best one."""
+    """Whether an alignment is in another place and its score is nearly the best."""
     step = relative_step(best.pose, other.pose)
     is_elsewhere = math.hypot(step[0], step[1]) > ELSEWHERE or abs(float(step[2])) > ELSEWHERE_TURN
     return is_elsewhere and other.score > NEARLY * best.score
 
 
 def _stiffness(pull: FloatArray, points: int) -> FloatArray:
-    """The pull (3, 3) of a measured guess, beside a mean square of 1 of a full scan's residuals' change."""
+    """The information (3, 3) of a measured guess, relative to the mean information of a scan's pairs."""
     return WEAK_PRIOR + np.linalg.inv(pull) * POINT_ERROR**2 * CORRELATED / points
 
 
 def _wrap(angle: float) -> float:
-    """An angle in radians, brought into [-pi, pi)."""
+    """An angle in radians, wrapped to [-pi, pi)."""
     return (float(angle) + math.pi) % (2 * math.pi) - math.pi

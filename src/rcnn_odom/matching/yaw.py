@@ -1,4 +1,8 @@
-"""How far a scan is turned, from its normals alone: circular correlation of their histograms."""
+"""The turn between two scans from their normals alone, by circular correlation of histograms.
+
+Weiss, Wetzler and von Puttkamer, "Keeping track of position and orientation of moving indoor systems by
+correlation of range-finder scans", IROS 1994.
+"""
 
 import numpy as np
 
@@ -6,9 +10,9 @@ from rcnn_odom.compiled import compiled
 from rcnn_odom.geometry import FloatArray, wrap_angle
 
 BINS = 360
-"""Of the circle of directions, so that each is a degree wide."""
+"""Bins of directions, each one degree wide."""
 SMOOTH = 3
-"""Bins on each side over which a direction is spread."""
+"""Bins on each side over which each direction is smoothed."""
 
 
 @compiled
@@ -26,7 +30,7 @@ def _histogram(normals):  # type: ignore[no-untyped-def]
 
 
 def turn_candidates(before: FloatArray, now: FloatArray, most: int) -> FloatArray:
-    """The turns between two scans by which their normals agree best.
+    """The turns of the laser between two scans for which their normals agree best.
 
     Args:
         before, now: (P, 2), (Q, 2) normals, each in the frame of its scan.
@@ -34,6 +38,14 @@ def turn_candidates(before: FloatArray, now: FloatArray, most: int) -> FloatArra
 
     Returns:
         (N,) radians in [-pi, pi), the best first; N is at most ``most``.
+
+    Example:
+        The laser turns by 30 degrees to the left, so that two walls appear 30 degrees further to the right:
+
+        >>> before, now = np.deg2rad([180.5, 280.5]), np.deg2rad([150.5, 250.5])
+        >>> normals = [np.stack([np.cos(angles), np.sin(angles)], axis=1) for angles in (before, now)]
+        >>> np.rad2deg(turn_candidates(*normals, most=1)).round(6)
+        array([30.])
     """
     spectra = np.fft.rfft(_histogram(before)) * np.conj(np.fft.rfft(_histogram(now)))
     agreement = np.fft.irfft(spectra, BINS)
