@@ -586,10 +586,10 @@ def test_shapes_that_are_no_scan(recorder, scan, angles):
 
 
 def test_a_file_of_another_sensor_is_refused():
-    sensor = Odometer.from_onnx("rcnn_small").sensor
-    assert Odometer.from_onnx("rcnn_small", sensor=sensor)
+    sensor = Odometer.from_onnx("all_round").sensor
+    assert Odometer.from_onnx("all_round", sensor=sensor)
     with pytest.raises(InputError, match=r"made for .*360.*, not .*180"):
-        Odometer.from_onnx("rcnn_small", sensor=Sensor(1.0, 180.0, 40.0))
+        Odometer.from_onnx("all_round", sensor=Sensor(1.0, 180.0, 40.0))
 
 
 # --- poses of a robot, and how far off they are -----------------------------------------------------

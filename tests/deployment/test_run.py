@@ -10,7 +10,6 @@ import time
 from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -38,6 +37,7 @@ from rcnn_odom.cli import main
 from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.run import run
 from rcnn_odom.errors import InputError
+from rcnn_odom.evaluation.figures import new_figure
 from rcnn_odom.geometry import FORWARD_CAMERA, Step, change_frame, planar_to_poses, relative_steps
 from rcnn_odom.models.contract import Description, Registered, find_model
 from rcnn_odom.models.encoding import Sensor, encode
@@ -49,7 +49,7 @@ from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import read_kitti, read_tum
 from rcnn_odom.training.onnx_graph import to_onnx, write
 
-FILES = {"trajectory.txt", "trajectory.tum", "steps.jsonl", "map.png", "summary.json"}
+FILES = {"trajectory.txt", "trajectory.tum", "steps.jsonl", "report.html", "summary.json"}
 
 
 @pytest.fixture(scope="module")
@@ -66,6 +66,13 @@ def velodyne(tmp_path_factory):
     path = tmp_path_factory.mktemp("model") / "ring.onnx"
     write(to_onnx(build(sensor=Sensor(0.5, 360.0, 80.0)), "fp32"), path)
     return str(path)
+
+
+@pytest.fixture(autouse=True)
+def no_time_plots(monkeypatch):
+    """Which take seconds for each run; test_report_page.py draws them."""
+    for name in ("_motion", "_deviations"):
+        monkeypatch.setattr(f"rcnn_odom.deployment.report_pictures.{name}", lambda timeline: ())
 
 
 def numbers(pose):
@@ -96,9 +103,10 @@ def test_a_carmen_log_gives_the_poses_of_the_odometer(model, tmp_path, capsys):
     summary = json.loads((out / "summary.json").read_text())
     assert (summary["scans"], summary["degraded"], summary["skipped"]) == (30, {}, {})
     assert 0 < summary["latency"]["median_ms"] <= summary["latency"]["p99_ms"] <= summary["latency"]["max_ms"]
-    printed = capsys.readouterr().out
-    assert "robot.log: 30 scans" in printed
-    assert "99th percentile" in printed
+    *_, path, speed, trouble = capsys.readouterr().out.splitlines()
+    assert path.startswith(f"path     30 scans, {summary['path_m']:.1f} m driven; ended ")
+    assert speed.startswith("speed    ")
+    assert trouble == f"trouble  none; look at {out / 'report.html'}"
 
 
 def test_a_checkpoint_is_exported_and_run(tmp_path):
@@ -176,7 +184,7 @@ def test_a_log_that_breaks_off_leaves_valid_files(model, tmp_path, capsys):
     count = len(read_kitti(out / "trajectory.txt"))
     assert 0 < count < 80
     assert count == len(read_tum(out / "trajectory.tum")[0]) == len(steps_in(out)) == summary["scans"]
-    assert (out / "map.png").exists()
+    assert "The run ended before the recording did" in (out / "report.html").read_text()
 
 
 def start(*arguments, **options):
@@ -273,8 +281,8 @@ def test_live_without_a_scan(model, capsys, monkeypatch):
     ("arguments", "message"),
     [
         ([], "give one INPUT or --live"),
-        (["a", "--live", "--model", "rcnn_small"], "give one INPUT or --live"),
-        (["a", "b", "--model", "rcnn_small"], "give one INPUT or --live"),
+        (["a", "--live", "--model", "all_round"], "give one INPUT or --live"),
+        (["a", "b", "--model", "all_round"], "give one INPUT or --live"),
         (["a.bag", "b.bag", "--out", "x"], "give one INPUT or --live"),
         (["a"], "--out DIR is needed"),
         (["a", "--out", "x", "--threads", "2"], "--threads is of a network (--model), not of the matcher"),
@@ -284,7 +292,7 @@ def test_live_without_a_scan(model, capsys, monkeypatch):
         ),
         (["a", "--out", "x", "--model", "b.onnx", "--deskew", "on"], "--deskew is of the matcher"),
         (
-            ["a", "--out", "x", "--model", "rcnn_small", "--odom-topic", "/odom"],
+            ["a", "--out", "x", "--model", "all_round", "--odom-topic", "/odom"],
             "--odom-topic is of the matcher",
         ),
         (["a", "--out", "x", "--deskew", "perhaps"], "invalid choice: 'perhaps'"),
@@ -311,7 +319,7 @@ def test_wrong_usage(arguments, message, capsys):
 @pytest.mark.parametrize(
     ("old", "new"),
     [
-        (["rcnn_small", "my drive", "--out", "x"], "rcnn-odom run 'my drive' --model rcnn_small --out x"),
+        (["all_round", "my drive", "--out", "x"], "rcnn-odom run 'my drive' --model all_round --out x"),
         (["RUN/best.ckpt", "a.bag", "--out", "x"], "rcnn-odom run a.bag --model RUN/best.ckpt --out x"),
         (["--live", "net.onnx"], "rcnn-odom run --model net.onnx --live"),
         (
@@ -385,7 +393,7 @@ def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_pa
     assert message == (
         "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
         "degrees, one every 1; take --model matcher, which fits any laser, or train a model on recordings of "
-        "such a laser (python train.py data=... data.sensor.field_of_view_deg=180 "
+        "such a laser (rcnn-odom train data=... data.sensor.field_of_view_deg=180 "
         "data.sensor.resolution_deg=1 data.sensor.facing_deg=90)"
     )
     assert written == 0
@@ -449,17 +457,26 @@ def case(name):
 @pytest.mark.parametrize(
     ("name", "scans", "metres", "degraded"),
     [
-        # The same scans as the next one's, but the first three are none: three steps less.
-        ("slow_start.bag", 40, 35.8, {"no returns": 2, "other laser": 1}),
-        ("range_max_0.bag", 40, 38.6, {}),
-        ("foreign_topic.bag", 10, 8.7, {}),
+        # The same scans as the next one's, but the first two are none: two steps less. The third has less
+        # than half of the beams, which lie as those after it.
+        ("slow_start.bag", 40, 31.9, {"no returns": 2}),
+        ("range_max_0.bag", 40, 33.7, {}),
+        ("foreign_topic.bag", 10, 7.8, {}),
     ],
 )
 def test_cases_that_are_read(tmp_path, name, scans, metres, degraded):
-    assert main(["run", "--model", "rcnn_small", str(case(name)), "--out", str(tmp_path / "out")]) == 0
+    """By a network, over the length that scan matching finds."""
+    assert main(["run", "--model", "all_round", str(case(name)), "--out", str(tmp_path / "out")]) == 0
     summary = json.loads((tmp_path / "out" / "summary.json").read_text())
     assert (summary["scans"], summary["degraded"]) == (scans, degraded)
     assert summary["path_m"] == pytest.approx(metres, rel=0.02)
+
+
+def test_a_scan_of_too_few_beams_is_left_out_by_a_network_that_needs_all(velodyne, tmp_path):
+    case_, out = case("slow_start.bag"), tmp_path / "out"
+    assert main(["run", "--model", velodyne, str(case_), "--out", str(out)]) == 0
+    degraded = json.loads((out / "summary.json").read_text())["degraded"]
+    assert degraded == {"no returns": 2, "other laser": 1}
 
 
 def test_a_laser_that_sees_the_left_half_is_refused_or_read_whole(model, tmp_path, capsys):
@@ -583,27 +600,28 @@ def test_the_map_shows_walls_where_they_are(tmp_path):
         poses.append([pose.x, pose.y, pose.heading])
     seen = np.concatenate(points)
     assert np.abs(np.abs(seen).max(1) - 10).max() < 0.1
-    map_figure("room", np.array(poses), points).savefig(tmp_path / "map.png")
+    map_figure(np.array(poses), points, np.arange(5.0)).savefig(tmp_path / "map.png")
     assert (tmp_path / "map.png").stat().st_size > 5000
-    map_figure("nothing seen", np.zeros((1, 3)), [np.empty((0, 2), np.float32)])
+    # Nothing seen, and nothing moved.
+    map_figure(np.zeros((1, 3)), [np.empty((0, 2), np.float32)], np.zeros(1)).savefig(tmp_path / "no.png")
 
 
 def test_the_map_has_no_ghosts(monkeypatch, tmp_path):
     """While nothing is seen, the walls of the last scan stay where they were."""
     drawn = []
 
-    def map_figure(title, poses, points):
+    def map_figure(poses, points, times, clock):
         drawn.extend(points)
-        return SimpleNamespace(savefig=lambda *arguments, **options: None)
+        return new_figure(1, 1)[0]
 
-    monkeypatch.setattr("rcnn_odom.evaluation.figures.map_figure", map_figure)
+    monkeypatch.setattr("rcnn_odom.deployment.report_pictures.map_figure", map_figure)
     angles = np.deg2rad(np.arange(360) - 180.0)
     x = np.cos(angles)
     wall = [np.where(x > 0.3, (10 - 0.5 * n) / x, 0.0) for n in range(3)]  # it is 10 m ahead at first
     rows = [Scan(scan, angles, stamp=0.1 * n) for n, scan in enumerate([*wall, *[np.zeros(360)] * 5])]
     rows.insert(3, Scan(wall[0], angles, stamp=0.1))  # late
     run(Odometer(PairTracker(_Straight())), ScanStream("room", iter(rows)), "straight", tmp_path / "out")
-    assert [len(points) > 0 for points in drawn] == [True] * 3 + [False] * 6
+    assert [len(points) > 0 for points in drawn] == [True] * 3 + [False] * 7, "the last one is the end"
     np.testing.assert_allclose(np.concatenate(drawn)[:, 0], 10.0, atol=0.1)
 
 
@@ -701,8 +719,7 @@ def test_without_a_model_it_is_the_matcher_for_any_laser(asked, tmp_path, capsys
     assert (summary["model"], summary["scans"], summary["laser_pose"]) == ("matcher", 8, None)
     assert summary["path_m"] == pytest.approx(3.5)
     assert asked.made == (False, True)
-    printed = capsys.readouterr().out
-    assert "scans.jsonl: 8 scans, 3.5 m by matcher" in printed
+    assert "path     8 scans, 3.5 m driven; ended " in capsys.readouterr().out
     covariance = np.array(steps_in(tmp_path / "out")[-1]["pose_covariance"])
     assert np.linalg.eigvalsh(covariance).min() > 0
 
@@ -748,8 +765,10 @@ def test_the_poses_of_a_robot_whose_laser_sits_aside(asked, tmp_path, capsys):
     np.testing.assert_allclose(got, poses, atol=1e-9)
     camera = change_frame(np.array(poses), FORWARD_CAMERA)
     np.testing.assert_allclose(read_kitti(tmp_path / "out" / "trajectory.txt"), camera, atol=1e-9)
-    printed = capsys.readouterr().out
-    assert "poses of the robot, with its laser -0.3 m ahead, 0.1 m to the left, turned by -90 deg" in printed
+    assert " m driven by the robot; ended " in capsys.readouterr().out
+    page = (tmp_path / "out" / "report.html").read_text()
+    assert "of the robot, with its laser -0.3 m ahead, 0.1 m to the left, turned by -90 degrees" in page
+    assert "<th>--laser-pose</th><td>-0.3 0.1 -90</td>" in page
 
 
 def test_the_wheels_of_a_log_or_none(asked, monkeypatch, tmp_path, capsys):
@@ -898,7 +917,7 @@ BLOCKED = ("torch", "lightning", "pytorch_lightning", "hydra", "omegaconf")
 FORBID = f"import sys; sys.modules.update(dict.fromkeys({BLOCKED!r}))"
 
 
-@pytest.mark.parametrize("words", [[], ["--model", "rcnn_small"], ["--model", "fused"]])
+@pytest.mark.parametrize("words", [[], ["--model", "all_round"], ["--model", "fused"]])
 def test_the_command_needs_no_pytorch(tmp_path, words):
     make_kitti(tmp_path, ["05"], frames=4)
     command = ["run", str(tmp_path / "sequences" / "05"), *words, "--out", str(tmp_path / "out")]

@@ -21,10 +21,12 @@ from rcnn_odom.cli.arguments import (
     split_thinning,
     whole_number,
 )
+from rcnn_odom.cli.full import need_full
 from rcnn_odom.errors import InputError
 
 if TYPE_CHECKING:
     from rcnn_odom.deployment.odometer import Pose
+    from rcnn_odom.deployment.output import Output
     from rcnn_odom.models.contract import ScanTracker
     from rcnn_odom.recordings.stream import ScanStream
 
@@ -48,7 +50,8 @@ def add(commands: Subcommands) -> None:
         "network, from a recording: a folder of a KITTI sequence or of a KITTI raw "
         "drive, a CARMEN log, a ROS bag with LaserScan or PointCloud2 messages (ROS 1, ROS 2 sqlite3 or "
         "mcap; no ROS needed), or a file of JSON lines; packed ones too. Writes trajectory.txt "
-        "(KITTI), trajectory.tum, steps.jsonl (each step with its uncertainty), map.png and summary.json. "
+        "(KITTI), trajectory.tum, steps.jsonl (each step with its uncertainty), summary.json and "
+        "report.html, which is made to be looked at. "
         "With --live: scans as JSON lines from standard input, such as "
         '{"stamp": 1.0, "ranges": [2.5, ...], "angle_min": -3.14, "angle_increment": 0.0031}, and a pose '
         "for each on standard output.",
@@ -60,19 +63,33 @@ def add(commands: Subcommands) -> None:
     add(
         "--model",
         metavar="MODEL",
-        help="matcher (scan matching, the default), an exported .onnx, a .ckpt, or rcnn_small, which ships "
-        "along; or fused: scan matching with a network's steps as its priors",
+        help="matcher (scan matching, the default), an exported .onnx, a .ckpt, or all_round or "
+        "half_circle, which ship along; or fused: scan matching with a network's steps as its priors",
     )
     add(
         "--network",
         metavar="NETWORK",
-        help="of --model fused: an exported .onnx, a network that ships along (rcnn_small), or held",
+        help="of --model fused: an exported .onnx, a network that ships along (all_round), or held",
     )
     add("--every", type=whole_number(1), metavar="N", help="take every N-th scan only")
+    _add_outputs(parser)
     _add_poses_and_priors(parser)
     _add_format_options(parser)
     add("--threads", type=whole_number(1), metavar="N", help="of a network's computation (1)")
     parser.set_defaults(run=lambda arguments: _run(parser, arguments))
+
+
+def _add_outputs(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
+    add(
+        "--mcap",
+        type=Path,
+        metavar="FILE.mcap",
+        help="write odometry, path, scans, local map and transforms as messages of ROS 2, for Foxglove or "
+        "ros2 bag",
+    )
+    add("--rerun", type=Path, metavar="FILE.rrd", help="write the same for rerun's viewer (the extra view)")
+    add("--view", action="store_true", help="open rerun's viewer while the run goes (the extra view)")
 
 
 def _add_poses_and_priors(parser: argparse.ArgumentParser) -> None:
@@ -109,8 +126,10 @@ def _add_format_options(parser: argparse.ArgumentParser) -> None:
 
 def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     _check(parser, arguments)
+    outputs = _make_outputs(arguments)
     from rcnn_odom.deployment.odometer import Odometer
-    from rcnn_odom.deployment.run import format_summary, run
+    from rcnn_odom.deployment.run import PAGE, run
+    from rcnn_odom.deployment.three_lines import format_lines
 
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     model = arguments.model or MATCHER
@@ -119,15 +138,48 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     odometer = Odometer(
         network or _build_matcher(arguments, stream), arguments.laser_pose or stream.laser_pose
     )
-    if arguments.live:
-        summary = run(odometer, stream, Path(model).stem, arguments.out, _print_pose)
-        print(format_summary(summary), file=sys.stderr)
-        return 0
-    for note in stream.notes:
-        print(f"{stream.name}: {note}")
-    print(format_summary(run(odometer, stream, Path(model).stem, arguments.out)))
-    print(f"all of it is in {shlex.quote(str(arguments.out))}")
+    if not arguments.live:
+        for note in stream.notes:
+            print(f"{stream.name}: {note}")
+    on_pose = _print_pose if arguments.live else None
+    name, settings = Path(model).stem, _settings(arguments)
+    summary = run(odometer, stream, name, arguments.out, on_pose, settings, outputs)
+    page = arguments.out / PAGE if arguments.out else None
+    # What answers a live laser is poses alone.
+    print(format_lines(summary, page), file=sys.stderr if arguments.live else sys.stdout)
     return 0
+
+
+def _make_outputs(arguments: argparse.Namespace) -> "list[Output]":
+    """What takes the poses beside the folder; each says at once whether it can.
+
+    Raises:
+        InputError: one cannot.
+    """
+    outputs: list[Output] = []
+    if arguments.mcap:
+        from rcnn_odom.deployment.mcap_log import McapLog
+
+        outputs.append(McapLog(arguments.mcap, (arguments.base or "base_link").lstrip("/")))
+    if arguments.rerun:
+        from rcnn_odom.deployment.rerun_log import RerunFile
+
+        outputs.append(RerunFile(arguments.rerun))
+    if arguments.view:
+        from rcnn_odom.deployment.rerun_log import RerunViewer
+
+        outputs.append(RerunViewer())
+    return outputs
+
+
+def _settings(arguments: argparse.Namespace) -> dict[str, str]:
+    """The options that were given, for the report."""
+    given = {
+        _option(name): " ".join(_as_words(name, value)) or "yes"
+        for name, value in vars(arguments).items()
+        if name not in ("paths", "out", "run") and value not in (None, False)
+    }
+    return {"INPUT": " ".join(arguments.paths), **given} if arguments.paths else given
 
 
 def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
@@ -141,8 +193,8 @@ def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> No
         raise InputError(f"--model {OLD_NAME} has become --model {MATCHER}, the default; leave --model out")
     if len(arguments.paths) != (0 if arguments.live else 1):
         parser.error("give one INPUT or --live")
-    if not arguments.live and arguments.out is None:
-        parser.error("--out DIR is needed")
+    if not (arguments.live or arguments.out or arguments.mcap or arguments.rerun or arguments.view):
+        parser.error("--out DIR is needed, or --mcap, --rerun or --view")
     if arguments.base and arguments.laser_pose:
         parser.error("--base and --laser-pose say the same; give one of them")
     if arguments.wheels and arguments.odom_topic:
@@ -274,6 +326,7 @@ def _build_matcher(arguments: argparse.Namespace, stream: "ScanStream") -> "Scan
 
 def _load_network(model: str, threads: int) -> "ScanTracker":
     if model.endswith(".ckpt"):
+        need_full(f"{model}: a checkpoint")
         from rcnn_odom.training.export import load_odometer
 
         return load_odometer(Path(model), threads).tracker

@@ -33,21 +33,31 @@ LaserPose = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class Pose:
-    """Where the laser is, seen from where its first scan was taken, and the step since the last pose.
+    """The pose of the laser in the frame of its first scan, and the step from the previous pose.
 
-    Of an odometer that is told where the laser sits on the robot, all of it is the robot's.
+    If the odometer knows the pose of the laser on the robot, pose and step are those of the robot.
 
     Attributes:
-        stamp: seconds, of the scan; None where it has none.
-        x, y: metres, x ahead and y to the left of the first pose.
+        stamp: seconds, of the scan; None if it has none.
+        x, y: metres ahead and to the left of the first pose.
         heading: radians, counter-clockwise, not wrapped.
-        step: from the pose before. Of a network its covariance is fitted so that 68 % of the errors on
-            validation drives lie within one standard deviation; nan where the model does not know it. Where
-            the last motion only went on, the deviations are as large as typical motions.
-        covariance: (3, 3) of x, y and heading in the frame of the first pose, accumulated from those of the
-            steps; of a network as if their errors were independent. From a step of unknown
-            covariance on what depends on it stays nan.
-        degraded: empty, or in words why the estimate is worse than its model's usual.
+        step: from the previous pose. Its covariance is nan if the model gives none. A network's covariance is
+            fitted so that 68 % of the errors on validation drives lie within one standard deviation. If the
+            last motion was only repeated, the deviations are as large as typical motions.
+        covariance: (3, 3) of x, y and heading in the frame of the first pose, accumulated over the steps; for
+            a network as if their errors were independent. After a step of unknown covariance the entries that
+            depend on it stay nan.
+        degraded: why the estimate is worse than usual for its model, in words; otherwise empty.
+
+    Example:
+        >>> pose = Pose(stamp=0.5, x=1.0, y=2.0, heading=np.pi / 2)  # 1 m ahead, 2 m to the left, turned left
+        >>> pose.matrix().round(3)
+        array([[ 0., -1.,  0.,  1.],
+               [ 1.,  0.,  0.,  2.],
+               [ 0.,  0.,  1.,  0.],
+               [ 0.,  0.,  0.,  1.]])
+        >>> pose.as_dict()["stamp"], pose.as_dict()["x"]
+        (0.5, 1.0)
     """
 
     stamp: float | None = None
@@ -59,11 +69,11 @@ class Pose:
     degraded: str = ""
 
     def matrix(self) -> FloatArray:
-        """Laser, or robot, to the frame of the first pose, (4, 4)."""
+        """The transform (4, 4) from the laser's, or the robot's, frame to the frame of the first pose."""
         return planar_to_poses([[self.x, self.y, self.heading]])[0]
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain values for JSON, None in place of nan."""
+        """Plain values for JSON, with None for nan."""
         return {
             "stamp": self.stamp,
             "x": self.x,
@@ -83,28 +93,35 @@ def _without_nan(covariance: FloatArray) -> list[list[float | None]]:
 class Odometer:
     """Poses from the scans of one laser, in their order.
 
-    What may go wrong in a stream never raises. The pose's ``degraded`` then says what happened, the kind of
-    it before a colon: see :class:`rcnn_odom.models.tracking.Tracking` for what stamps and frames tell,
-    :class:`rcnn_odom.models.pairs.PairTracker` for networks, and the matcher for what it adds.
+    Problems of the stream raise no error. The pose's ``degraded`` then says what happened, beginning with its
+    kind and a colon. The kinds are documented in :class:`rcnn_odom.models.tracking.Tracking` for stamps and
+    frames, in :class:`rcnn_odom.models.pairs.PairTracker` for networks and in
+    :class:`rcnn_odom.models.matcher.MatcherTracker` for scan matching.
 
     Args:
-        tracker: the model; None: scan matching, which needs no training and takes any 2D laser.
-        laser_pose: x and y in metres and heading in radians of the laser on the robot, whose poses are then
-            given; None: poses of the laser.
+        tracker: the model; None for scan matching, which needs no training and works with any 2D laser.
+        laser_pose: x and y in metres and heading in radians of the laser on the robot, for poses of the
+            robot; None for poses of the laser.
 
     Attributes:
         tracker, laser_pose: as given.
-        estimates: steps that were estimated from their scan.
+        estimates: number of steps that were estimated from their scan.
 
-    >>> bearings = np.deg2rad(np.arange(-90.0, 91.0))
-    >>> pose = Odometer().step(np.full(181, 8.0), stamp=0.0, angles=bearings)
-    >>> pose.x, pose.y, pose.heading
-    (0.0, 0.0, 0.0)
+    Example:
+        A square room of 8 m, seen from its centre and then from 1 m ahead:
+
+        >>> bearings = np.deg2rad(np.arange(0.5, 360.0))
+        >>> cos, sin, odometer = np.cos(bearings), np.abs(np.sin(bearings)), Odometer()
+        >>> for x in (0.0, 1.0):
+        ...     ranges = np.minimum((4 - x * np.sign(cos)) / np.abs(cos), 4 / sin)
+        ...     pose = odometer.step(ranges, stamp=x, angles=bearings)
+        >>> round(pose.x, 2), odometer.estimates
+        (1.0, 1)
     """
 
     def __init__(self, tracker: ScanTracker | None = None, laser_pose: LaserPose | None = None) -> None:
         if tracker is None:
-            # Compiled code, which networks do not need.
+            # Imported here because networks do not need its compiled code.
             from rcnn_odom.models.matcher import MatcherTracker
 
             tracker = MatcherTracker()
@@ -122,13 +139,20 @@ class Odometer:
         """The network of a file written by ``rcnn-odom export``, computed by ONNX Runtime.
 
         Args:
-            path: the file, or the name of a model that ships with the project, ``rcnn_small``.
-            sensor: which it must have been trained for; None for any.
-            threads: of the computation.
+            path: the file, or the name of a model that ships with the project, ``all_round`` or
+                ``half_circle``.
+            sensor: the sensor for which it must have been trained; None for any.
+            threads: number of threads of the computation.
             laser_pose: as above.
 
         Raises:
-            InputError: no such file, not one of ``rcnn-odom export``, or of another sensor.
+            InputError: there is no such file, it was not written by ``rcnn-odom export``, or it was trained
+                for another sensor.
+
+        Example:
+            >>> odometer = Odometer.from_onnx("all_round")
+            >>> odometer.sensor.field_of_view_deg
+            360.0
         """
         stepper = OnnxStepper(find_file(path), threads)
         if sensor is not None and stepper.description.sensor != sensor:
@@ -139,10 +163,15 @@ class Odometer:
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> "Odometer":
-        """Tells where to go with a checkpoint, which is exported before it runs.
+        """Says how to use a checkpoint, which has to be exported first.
 
         Raises:
             InputError: always.
+
+        Example:
+            >>> Odometer.from_checkpoint("best.ckpt")
+            Traceback (most recent call last):
+            rcnn_odom.errors.InputError: best.ckpt: a checkpoint is exported before it runs: ...
         """
         raise InputError(
             f"{path}: a checkpoint is exported before it runs: rcnn-odom export {shlex.quote(str(path))}, "
@@ -150,7 +179,15 @@ class Odometer:
         )
 
     def reset(self) -> None:
-        """Begins anew: the next scan is the origin."""
+        """Forgets everything: the next scan is the origin.
+
+        Example:
+            >>> odometer = Odometer()
+            >>> pose = odometer.step([[2.0, 0.0], [0.0, 1.0]])
+            >>> odometer.reset()
+            >>> len(odometer.returns())
+            0
+        """
         self._tracking = Tracking(self.tracker)
         self._position, self._covariance, self._last_pose = np.zeros(3), AccumulatedCovariance(), Pose()
         self._is_used, self.estimates = False, 0
@@ -162,12 +199,12 @@ class Odometer:
 
     @property
     def beam_check(self) -> BeamCheck | None:
-        """What compares the scans' beams with those that a network knows; None: the model takes any laser."""
+        """Compares the beams of scans with those a network knows; None if the model works with any laser."""
         return self.tracker.beam_check if isinstance(self.tracker, PairTracker) else None
 
     @property
     def sensor(self) -> Sensor | None:
-        """The laser that a network was trained for; None: the model takes any."""
+        """The laser for which a network was trained; None if the model works with any."""
         return self.tracker.description.sensor if isinstance(self.tracker, PairTracker) else None
 
     def step(
@@ -177,15 +214,14 @@ class Odometer:
 
         Args:
             scan: a :class:`Scan`, which has its own stamp and bearings; or ranges (P,) in metres,
-                counter-clockwise; or points (P, 2 or more), x ahead and y to the left in metres. What is not
-                positive, not finite, or at a network's maximum range or beyond it is no return.
-            stamp: seconds, of ranges or points. Without one (None, nan) the scan counts as the next after
-                the last one.
-            angles: of the ranges, (P,) radians, 0 ahead, counter-clockwise. None, for networks: evenly over
-                the sensor's field of view, from its right end or from behind on.
+                counter-clockwise; or points (P, 2 or more), x ahead and y to the left in metres. A range that
+                is not positive, not finite, or at least a network's maximum range is no return.
+            stamp: seconds, for ranges or points. Without one (None, nan) the scan is taken as the next one.
+            angles: (P,) bearings of the ranges in radians, 0 ahead, counter-clockwise. None, for networks
+                only: evenly spaced over the sensor's field of view, from its right end or from behind.
 
         Raises:
-            ValueError: the arrays' shapes do not fit, or nothing says where the beams lie.
+            ValueError: the shapes of the arrays do not match, or the bearings of the beams are unknown.
         """
         if not isinstance(scan, Scan):
             scan = _as_scan(scan, stamp, angles)
@@ -209,14 +245,38 @@ class Odometer:
         """Points (P, 2) in metres of the last scan in the frame of the first pose.
 
         Empty if the last scan had no return or was not used.
+
+        Example:
+            >>> odometer = Odometer()
+            >>> pose = odometer.step([[2.0, 0.0], [0.0, 1.0]])  # a scan given as two points
+            >>> odometer.returns().round(3).tolist()
+            [[2.0, 0.0], [0.0, 1.0]]
         """
         if not self._is_used:
             return np.empty((0, 2), np.float32)
+        return self._from_laser(self.tracker.returns())
+
+    def local_map(self) -> npt.NDArray[np.float32] | None:
+        """Points (C, 2) in metres of the map of scan matching, in the frame of the first pose.
+
+        None if the model keeps no map.
+
+        Example:
+            >>> odometer = Odometer()
+            >>> pose = odometer.step([[2.0, y / 10] for y in range(-10, 11)])  # a wall 2 m ahead
+            >>> set(odometer.local_map()[:, 0].round(3).tolist())
+            {2.0}
+        """
+        map_points = getattr(self.tracker, "map_points", None)
+        return None if map_points is None else self._from_laser(map_points())
+
+    def _from_laser(self, points: FloatArray) -> npt.NDArray[np.float32]:
+        """Points (P, 2) from the laser's frame to the frame of the first pose."""
         place = (
             self._position if self.laser_pose is None else advance(self._position, np.array(self.laser_pose))
         )
         pose = planar_to_poses(place[None])[0]
-        return (self.tracker.returns() @ pose[:2, :2].T + pose[:2, 3]).astype(np.float32)
+        return (points @ pose[:2, :2].T + pose[:2, 3]).astype(np.float32)
 
 
 def _as_scan(values: npt.ArrayLike, stamp: float | None, angles: npt.ArrayLike | None) -> Scan:

@@ -4,37 +4,43 @@ import json
 import math
 import time
 from collections import Counter
-from collections.abc import Callable
-from contextlib import ExitStack, closing, suppress
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack, closing, contextmanager, suppress
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 from tqdm import tqdm
+from tqdm.contrib.logging import logging_redirect_tqdm
 
+from rcnn_odom import __version__
 from rcnn_odom.deployment.odometer import Odometer, Pose
+from rcnn_odom.deployment.output import Output
+from rcnn_odom.deployment.report_page import write_page
+from rcnn_odom.deployment.report_pictures import Seen
 from rcnn_odom.deployment.sampling import EvenSample
+from rcnn_odom.deployment.timeline import Timeline, causes_in
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame
 from rcnn_odom.models.tracking import PASSED_OVER
-from rcnn_odom.recordings.beams import compare_beams
+from rcnn_odom.recordings.beams import compare_beams, find_beams
 from rcnn_odom.recordings.returns import AbsentReturns
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
 TRAJECTORY, TUM, STEPS = "trajectory.txt", "trajectory.tum", "steps.jsonl"
-MAP, SUMMARY = "map.png", "summary.json"
+PAGE, SUMMARY = "report.html", "summary.json"
 MAP_SCANS = 2000
 """Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
 LATENCIES = 100_000
 FEW_SCANS = 6
 """Fewer than so many need not have two that can be compared."""
 ANOTHER_MODEL = (
-    "take --model matcher, which fits any laser, or train a model on recordings of such a laser (python "
-    "train.py data=... {})"
+    "take --model matcher, which fits any laser, or train a model on recordings of such a laser (rcnn-odom "
+    "train data=... {})"
 )
 GIVE_ANGLES = "give angle_min and angle_increment with its ranges, or points"
 
@@ -47,6 +53,8 @@ def run(
     model: str,
     out: Path | None = None,
     on_pose: Callable[[Pose], object] | None = None,
+    settings: Mapping[str, str] | None = None,
+    outputs: Sequence[Output] = (),
 ) -> Summary:
     """Poses for all scans of a stream.
 
@@ -57,11 +65,13 @@ def run(
         odometer: at its start.
         stream: the scans.
         model: what to call it.
-        out: folder for trajectories, steps, map and summary; it must not hold a trajectory yet.
+        out: folder for trajectories, steps, report and summary; it must not hold a trajectory yet.
         on_pose: gets every pose as soon as it is known.
+        settings: what else the user set, by name, in words for the report.
+        outputs: what else takes the poses and their scans, such as files for viewers.
 
     Returns:
-        What ``summary.json`` holds: counts, path, and the time of a scan.
+        What ``summary.json`` holds: counts, path, marked stretches, and the time of a scan.
 
     Raises:
         InputError: the folder holds a trajectory or cannot be written, the laser is another than the
@@ -73,9 +83,12 @@ def run(
     camera = FORWARD_CAMERA if odometer.laser_pose else stream.camera_from_laser
     with ExitStack() as stack:
         folder = OutputFolder(out, stream, camera, stack) if out else None
-        bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if out else True)
+        for output in outputs:
+            output.open(stream, odometer)
+            stack.callback(_finish, output, statistics)
         try:
-            for scan in stack.enter_context(closing(bar)):
+            # Of a live laser the poses are what is printed.
+            for scan in stack.enter_context(_show_progress(stream, bool(out or outputs) and not on_pose)):
                 if statistics.passes_over(scan):
                     continue
                 pose = statistics.step(scan)
@@ -83,14 +96,30 @@ def run(
                     folder.add(pose)
                 if on_pose:
                     on_pose(pose)
+                for output in outputs:
+                    output.add(pose, scan)
             statistics.require_usable_scans()
         except BaseException as error:
             statistics.stopped = str(error) or type(error).__name__
             raise
         finally:
             if folder:
-                folder.finish(statistics)
+                folder.finish(statistics, settings or {})
     return statistics.summary()
+
+
+def _finish(output: Output, statistics: "Statistics") -> None:
+    output.finish(statistics.can_use)
+
+
+@contextmanager
+def _show_progress(stream: ScanStream, is_wanted: bool) -> Iterator["tqdm[Scan]"]:
+    """The scans, with a bar if standard error is a terminal; what is logged meanwhile stands above it."""
+    bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if is_wanted else True)
+    with closing(bar), ExitStack() as stack:
+        if not bar.disable:
+            stack.enter_context(logging_redirect_tqdm())
+        yield bar
 
 
 class Statistics:
@@ -103,6 +132,8 @@ class Statistics:
 
     Attributes:
         can_use: there was a scan that fits the model and has returns.
+        timeline: what the report shows over time.
+        laser: what the scan with the most beams tells of it, in words.
 
     Raises:
         InputError: the stream's laser is another than a network's.
@@ -118,7 +149,8 @@ class Statistics:
             raise InputError(f"{stream.name}: {reason}; {advice}")
         self.degraded: Counter[str] = Counter()
         self.milliseconds = EvenSample[float](LATENCIES)
-        self.sample = EvenSample[tuple[Pose, npt.NDArray[np.float32]]](MAP_SCANS)
+        self.sample = EvenSample[Seen](MAP_SCANS)
+        self.timeline, self.laser, self._beams = Timeline(), "", 0
 
     def passes_over(self, scan: Scan) -> bool:
         """Whether nothing says where the beams of a scan lie, among others where something does; counts it.
@@ -152,10 +184,20 @@ class Statistics:
         self.path += math.hypot(pose.step.x, pose.step.y)
         self.longest = max(self.longest, milliseconds)
         self.milliseconds.add(lambda: milliseconds)
-        self.degraded.update(note.split(":")[0] for note in pose.degraded.split("; ") if note)
-        self.sample.add(lambda: (pose, odometer.returns()))
+        self.degraded.update(causes_in(pose.degraded))
+        if len(scan.ranges) > self._beams:
+            self._beams, self.laser = len(scan.ranges), describe_laser(scan, self.stream)
         # A scan that was passed over keeps the stamp of the pose that it repeats.
-        return pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
+        pose = pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
+        self._look(pose)
+        return pose
+
+    def _look(self, pose: Pose) -> None:
+        """Keeps what the report shows of a pose."""
+        self.timeline.add(pose)
+        seconds = self.timeline.seconds
+        time_of_it = float(self.scans) if seconds is None else seconds
+        self.sample.add(lambda: Seen((pose.x, pose.y, pose.heading), self.odometer.returns(), time_of_it))
 
     def require_usable_scans(self) -> None:
         """Looks at the end whether anything could be used.
@@ -178,6 +220,7 @@ class Statistics:
     def summary(self) -> Summary:
         """Plain values."""
         median, p99 = np.percentile(self.milliseconds.items, [50, 99]).tolist()
+        end = self.timeline.end
         return {
             "input": self.stream.name,
             "model": self.model,
@@ -188,8 +231,53 @@ class Statistics:
             "degraded": dict(self.degraded),
             "skipped": dict(self.stream.skipped),
             "latency": {"median_ms": median, "p99_ms": p99, "max_ms": self.longest},
+            "end": {"x": end.x, "y": end.y, "heading": end.heading},
+            "recording_s": self.timeline.seconds,
+            "speed": self._speed(),
+            "marked": self.timeline.marks.as_dict(),
             **({"stopped": self.stopped} if self.stopped else {}),
         }
+
+    def _speed(self) -> dict[str, float] | None:
+        """Metres per second of the way, if the recording tells the time."""
+        if not self.timeline.seconds:
+            return None
+        mean = self.path / self.timeline.seconds
+        return {"mean_m_s": mean, "top_m_s": max(mean, self.timeline.top_speed)}
+
+    def settings(self, given: Mapping[str, str]) -> dict[str, str]:
+        """What is known of the run, by name, in words, and what the user set."""
+        told = {
+            "recording": self.stream.name,
+            "model": self.model,
+            "laser": self.laser,
+            "poses": "of the laser",
+        }
+        if self.odometer.laser_pose:
+            x, y, heading = self.odometer.laser_pose
+            told["poses"] = (
+                f"of the robot, with its laser {x:g} m ahead, {y:g} m to the left, turned by "
+                f"{math.degrees(heading):.4g} degrees"
+            )
+        if self.timeline.seconds and self.scans > 1:
+            told["time between scans"] = f"{1e3 * self.timeline.seconds / (self.scans - 1):.3g} ms on average"
+        if self.stream.notes:
+            told["noticed"] = "; ".join(self.stream.notes)
+        now = datetime.now().strftime("%Y-%m-%d %H:%M")
+        return {**told, **given, "rcnn-odom": __version__, "date of this run": now}
+
+
+def describe_laser(scan: Scan, stream: ScanStream) -> str:
+    """What a scan and its recording tell of the laser, in words."""
+    frame = f", frame {scan.frame_id}" if scan.frame_id else ""
+    if stream.beams:
+        return f"beams {stream.beams}{frame}"
+    if not scan.has_all_beams:
+        return f"points, up to {len(scan.ranges)} in a scan{frame}"
+    with suppress(ValueError):
+        if scan.bearings is not None and len(scan.bearings) > 1:
+            return f"{len(scan.ranges)} beams {find_beams(scan.bearings)}{frame}"
+    return f"{len(scan.ranges)} beams{frame}"
 
 
 class OutputFolder:
@@ -240,23 +328,17 @@ class OutputFolder:
         self._steps.write(json.dumps(pose.as_dict()) + "\n")
         self._written += 1
 
-    def finish(self, statistics: Statistics) -> None:
-        """The map and the summary, where there is a pose; nothing at all where no scan could be used."""
+    def finish(self, statistics: Statistics, settings: Mapping[str, str]) -> None:
+        """The report and the summary, where there is a pose; nothing at all where no scan could be used."""
         if not self._written:
             return
         if not statistics.can_use:
             self._remove()
             return
-        from rcnn_odom.evaluation.figures import map_figure
-
-        (self.folder / SUMMARY).write_text(
-            json.dumps(statistics.summary(), indent=2) + "\n", encoding="utf-8"
-        )
-        poses = np.array([[pose.x, pose.y, pose.heading] for pose, _ in statistics.sample.items])
-        points = [points for _, points in statistics.sample.items]
-        name = self.stream.name.encode("utf-8", "replace").decode()  # of bytes that are no text
-        title = f"{name} by {statistics.model}: {statistics.scans} scans, {statistics.path:.0f} m"
-        map_figure(title, poses, points).savefig(self.folder / MAP, dpi=150)
+        summary = statistics.summary()
+        (self.folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
+        told = statistics.settings(settings)
+        write_page(self.folder / PAGE, summary, statistics.timeline, statistics.sample.items, told)
 
     def _remove(self) -> None:
         for name in (TRAJECTORY, TUM, STEPS):
@@ -264,24 +346,3 @@ class OutputFolder:
         for folder in self._made:
             with suppress(OSError):  # somebody else has put something there
                 folder.rmdir()
-
-
-def format_summary(summary: Summary) -> str:
-    """Lines for people."""
-    times = summary["latency"]
-    lines = [f"{summary['input']}: {summary['scans']} scans, {summary['path_m']:.1f} m by {summary['model']}"]
-    if summary["laser_pose"]:
-        x, y, heading = summary["laser_pose"]
-        lines.append(
-            f"poses of the robot, with its laser {x:g} m ahead, {y:g} m to the left, turned by "
-            f"{math.degrees(heading):.4g} degrees"
-        )
-    for title in ("degraded", "skipped"):
-        if summary[title]:
-            counts = ", ".join(f"{count} {kind}" for kind, count in summary[title].items())
-            lines.append(f"{title}: {counts}")
-    lines.append(
-        f"time of a scan: median {times['median_ms']:.2f} ms, 99th percentile {times['p99_ms']:.2f}, longest "
-        f"{times['max_ms']:.2f}"
-    )
-    return "\n".join(lines)

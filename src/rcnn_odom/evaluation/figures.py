@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 TRUTH, ESTIMATE = "tab:blue", "tab:red"
 """The paper's colours."""
+PATH_COLOURS = ("#3b1fa8", "#0a7fd0", "#009e73", "#e08a00", "#c8102e")
+"""Of a path from its start to its end; none is pale on white, and no two are alike in print."""
+NUMBERS_ON_PATH = 7
+"""Times that are written along a path at most."""
 
 
 def new_figure(width: float, height: float, **panels: Any) -> tuple["Figure", Any]:
@@ -93,26 +97,46 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
     return figure
 
 
-def map_figure(title: str, poses: FloatArray, points: list[npt.NDArray[np.float32]]) -> "Figure":
-    """Scans laid where they were taken, seen from above: how often each place returned a beam.
+def map_figure(
+    poses: FloatArray, points: list[npt.NDArray[np.float32]], times: FloatArray, clock: str = "seconds"
+) -> "Figure":
+    """Scans laid where they were taken, seen from above, and the path, coloured by time.
 
-    Where walls are thin lines the poses agree with each other; where they are doubled or blurred, not.
+    The darker a place, the more beams it returned. Where walls are thin lines the poses agree with each
+    other; where they are doubled or blurred, not.
 
     Args:
-        title: above the axes.
         poses: x, y and heading of the scans, (N, 3).
         points: of each scan (P, 2), in the frame of the poses, metres.
+        times: of the scans, (N,).
+        clock: what the times are.
     """
+    places = np.concatenate([*points, poses[:, :2]]) @ ((0, 1), (-1, 0))  # driving up the page
+    low, high = places.min(0), places.max(0)
+    width, height = np.maximum(high - low, 1.0).tolist()
+    scale = 5.2 / max(width, height)
+    figure, axes = new_figure(max(5.4, 0.9 + scale * width), max(3.4, 1.6 + scale * height))
+    _draw_returns(axes, places[: -len(poses)], low, high)
+    path = places[-len(poses) :]
+    for place, marker, label in ((path[0], "^", "start"), (path[-1], "X", "end")):
+        axes.plot(*place, marker, color="black", markersize=9, label=label, zorder=4)
+    _draw_path_by_time(axes, path, times, clock)
+    axes.set(xlabel="right of the start (m)", ylabel="ahead of the start (m)")
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.grid(alpha=0.3)
+    figure.legend(loc="outside upper center", ncols=3, frameon=False)
+    return figure
+
+
+def _draw_returns(axes: "Axes", places: FloatArray, low: FloatArray, high: FloatArray) -> None:
+    """Returns (P, 2) between two corners in metres, darker where there are more."""
     from matplotlib.colors import LogNorm
 
-    figure, axes = new_figure(9, 9)
-    x, y = np.concatenate(points).T
-    low, high = (np.array([f(-y, initial=0), f(x, initial=0)]) for f in (np.min, np.max))
     # As many cells as the picture has dots, so that a wall is as thin as it can be shown.
     cell = max(0.05, float((high - low).max()) / 1000)
-    cells = np.maximum(1, np.ceil((high - low) / cell)).astype(int)
-    limits = [(low[0], low[0] + cells[0] * cell), (low[1], low[1] + cells[1] * cell)]
-    counts, *_ = np.histogram2d(-y, x, bins=cells, range=limits)
+    cells = np.maximum(1, np.ceil((high - low) / cell)).astype(int).tolist()
+    limits = [(float(start), float(start + count * cell)) for start, count in zip(low, cells, strict=True)]
+    counts, *_ = np.histogram2d(places[:, 0], places[:, 1], bins=cells, range=limits)
     if counts.any():
         axes.imshow(
             np.ma.masked_equal(counts.T, 0),
@@ -121,11 +145,34 @@ def map_figure(title: str, poses: FloatArray, points: list[npt.NDArray[np.float3
             origin="lower",
             extent=(*limits[0], *limits[1]),
         )
-    axes.plot([], [], "s", color="0.3", markersize=4, label="returns, darker where more")
-    axes.plot(-poses[:, 1], poses[:, 0], color=ESTIMATE, linewidth=1.2, label="estimated path")
-    axes.plot(-poses[0, 1], poses[0, 0], "k^", label="start")
-    axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.grid(alpha=0.3)
-    axes.legend()
-    return figure
+    axes.plot([], [], "s", color="0.3", markersize=4, label="returns of the laser")
+
+
+def _draw_path_by_time(axes: "Axes", path: FloatArray, times: FloatArray, clock: str) -> None:
+    """A path (N, 2) in metres, its colour telling the time (N,), with a scale and numbers along it."""
+    from matplotlib.collections import LineCollection
+    from matplotlib.colors import LinearSegmentedColormap
+    from matplotlib.patheffects import withStroke
+    from matplotlib.ticker import MaxNLocator
+
+    colours = LinearSegmentedColormap.from_list("time", PATH_COLOURS)
+    ends = np.stack([path[:-1], path[1:]], axis=1)
+    pieces = LineCollection(list(ends), cmap=colours, linewidths=2, capstyle="round")
+    pieces.set_array(times[1:])
+    pieces.set_clim(times[0], max(times[-1], times[0] + 1e-9))
+    axes.add_collection(pieces)
+    axes.figure.colorbar(pieces, ax=axes, location="bottom", label=clock, aspect=40, shrink=0.9, pad=0.02)
+    near, written = 0.03 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())), [path[0], path[-1]]
+    for time in MaxNLocator(NUMBERS_ON_PATH).tick_values(times[0], times[-1]):
+        place = path[min(int(np.searchsorted(times, time)), len(path) - 1)]
+        if all(np.hypot(*(place - other)) > near for other in written):
+            written.append(place)
+            axes.plot(*place, "o", color="black", markersize=3.5, zorder=3)
+            axes.annotate(
+                f"{time:g}",
+                place,
+                (4, 4),
+                textcoords="offset points",
+                fontsize=9,
+                path_effects=[withStroke(linewidth=2.5, foreground="white")],
+            )

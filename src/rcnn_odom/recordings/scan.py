@@ -69,3 +69,18 @@ class Scan:
             raise ValueError(f"points are (P, 2 or more), not {values.shape}")
         x, y = values[:, 0], values[:, 1]
         return cls(np.hypot(x, y), np.arctan2(y, x), times, stamp, frame_id, has_all_beams=False)
+
+    def points(self) -> FloatArray:
+        """Its returns as points (R, 2) in metres, x ahead and y to the left; what is no return is left out.
+
+        Raises:
+            ValueError: nothing says where its beams lie.
+
+        >>> Scan(np.array([2.0, 0.0]), np.array([np.pi / 2, 0.0])).points().round(3).tolist()
+        [[0.0, 2.0]]
+        """
+        if self.bearings is None:
+            raise ValueError("ranges without bearings say nothing of where the beams lie")
+        seen = (self.ranges > 0) & np.isfinite(self.ranges) & np.isfinite(self.bearings)
+        ranges, bearings = self.ranges[seen], self.bearings[seen]
+        return np.column_stack([ranges * np.cos(bearings), ranges * np.sin(bearings)])
