@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test test-all coverage fuzz lint bench bench-train install
+.PHONY: train test test-all coverage fuzz lint bench bench-train install robot-wheel
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
@@ -34,6 +34,11 @@ bench: install
 
 bench-train: install
 	$(BIN)/python -m rcnn_odom.training.bench_train
+
+# From the files as they are, not as an earlier build has left them.
+robot-wheel: install
+	rm -rf robot/build
+	$(BIN)/pip wheel --no-deps --wheel-dir dist ./robot
 
 lint: install
 	$(BIN)/ruff check

@@ -2,15 +2,17 @@
 
 import json
 import os
-import shutil
 import subprocess
 import sys
+import tarfile
+from zipfile import ZipFile
 
 import numpy as np
 import pytest
 
-from conftest import LENGTHS, ROOT, SMALL
+from conftest import LENGTHS, ROOT, SMALL, SMALL_RECURRENT
 from data.make_kitti import make_kitti
+from wheels import PIP, build_wheel, copy_source
 
 pytestmark = pytest.mark.slow
 FINE = "data.sensor.resolution_deg=0.2"
@@ -18,33 +20,33 @@ FINE = "data.sensor.resolution_deg=0.2"
 
 
 @pytest.fixture(scope="module")
-def installed(tmp_path_factory):
+def source(tmp_path_factory):
+    """A copy of what the wheel is built from."""
+    return copy_source(tmp_path_factory.mktemp("checkout") / "source")
+
+
+@pytest.fixture(scope="module")
+def wheel(source, tmp_path_factory):
+    return build_wheel(source, tmp_path_factory.mktemp("wheel"))
+
+
+@pytest.fixture(scope="module")
+def installed(wheel, tmp_path_factory):
     """The folder into which pip has installed the wheel."""
-    pytest.importorskip("setuptools", reason="without setuptools no wheel can be built offline")
-    folder = tmp_path_factory.mktemp("wheel")
-    source = folder / "source"
-    source.mkdir()
-    shutil.copytree(ROOT / "src", source / "src", ignore=shutil.ignore_patterns("*.egg-info", "__pycache__"))
-    for name in ("pyproject.toml", "README.md"):
-        shutil.copy(ROOT / name, source)
-    pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-    build = ["wheel", "--no-deps", "--no-build-isolation", "--no-index", "--wheel-dir", folder, source]
-    subprocess.run([*pip, *build], check=True, timeout=300)
-    [wheel] = folder.glob("*.whl")
-    target = folder / "installed"
-    subprocess.run([*pip, "install", "--no-deps", "--no-index", "--target", target, wheel], check=True)
+    target = tmp_path_factory.mktemp("target") / "installed"
+    subprocess.run([*PIP, "install", "--no-deps", "--no-index", "--target", target, wheel], check=True)
     return target
 
 
 @pytest.fixture(scope="module")
 def call(installed, tmp_path_factory):
-    """Runs Python with the installed package from a folder of its own; what it printed."""
+    """Runs Python with the installed package from a folder of its own, or another; what it printed."""
     elsewhere = tmp_path_factory.mktemp("elsewhere")
 
-    def call(*arguments):
+    def call(*arguments, folder=elsewhere):
         environment = os.environ | {"PYTHONPATH": str(installed), "OMP_NUM_THREADS": "1"}
         command = [sys.executable, *map(str, arguments)]
-        done = subprocess.run(command, cwd=elsewhere, env=environment, capture_output=True, text=True)
+        done = subprocess.run(command, cwd=folder, env=environment, capture_output=True, text=True)
         assert done.returncode == 0, done.stdout + done.stderr
         return done.stdout
 
@@ -68,8 +70,55 @@ def test_the_package_is_the_installed_one(call, installed):
     assert (installed / "bin" / "rcnn-odom").exists()
 
 
+def contents(wheel):
+    with ZipFile(wheel) as file:
+        return {name: file.read(name) for name in file.namelist() if not name.endswith("/RECORD")}
+
+
+def test_the_wheel_holds_what_hydra_reads(wheel):
+    prefix = "rcnn_odom/conf/"
+    packed = {name: text for name, text in contents(wheel).items() if name.startswith(prefix)}
+    groups = {path.relative_to(ROOT / "conf"): path for path in (ROOT / "conf").rglob("*.yaml")}
+    sweeps = {path.relative_to(ROOT): path for path in (ROOT / "sweeps").glob("*.yaml")}
+    assert len(sweeps) > 5
+    assert packed == {f"{prefix}{name}": path.read_bytes() for name, path in (groups | sweeps).items()}
+
+
+def test_a_source_distribution_makes_the_same_wheel(source, wheel, tmp_path):
+    code = f"from setuptools import build_meta; print(build_meta.build_sdist({str(tmp_path)!r}))"
+    subprocess.run([sys.executable, "-c", code], cwd=source, check=True, capture_output=True, timeout=3600)
+    [packed] = tmp_path.glob("*.tar.gz")
+    with tarfile.open(packed) as file:
+        file.extractall(tmp_path, filter="data")
+    [unpacked] = (path for path in tmp_path.iterdir() if path.is_dir())
+    again = build_wheel(unpacked, tmp_path)
+    assert contents(again) == contents(wheel)
+
+
+def test_the_commands_of_a_checkout_work_in_any_folder(call, drives, tmp_path):
+    data = [f"data.root={drives}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
+    call(*command("train", "model=rcnn_reg", *SMALL, *SMALL_RECURRENT, *data), folder=tmp_path)
+    run = tmp_path / "outputs" / "latest"
+    assert "drift" in (run / "train.log").read_text()
+    call(*command("evaluate", "run=outputs/latest", "run_dir=again"), folder=tmp_path)
+    first, second = (json.loads((each / "metrics.json").read_text()) for each in (run, tmp_path / "again"))
+    assert first["variant"] == "rcnn_reg"
+    assert first["test"] == second["test"]
+    assert (tmp_path / "again" / "evaluate.log").exists()
+
+
+def test_a_sweep_of_the_project_is_found_and_reported(call, drives, tmp_path):
+    data = [f"data.root={drives}", "data=kitti", "data.train=['00']", "data.test=['05']", LENGTHS]
+    models = ("model=cnn_reg,cnn_cls", "seed=0")
+    call(*command("train", "--multirun", "+sweeps=table2", *models, *SMALL, *data), folder=tmp_path)
+    assert len(list((tmp_path / "outputs" / "table2").glob("*/metrics.json"))) == 2
+    call(*command("report", "outputs/table2"), folder=tmp_path)
+    report = (tmp_path / "outputs" / "table2" / "report.md").read_text()
+    assert "    rcnn-odom train -m +sweeps=table2 model=cnn_reg,cnn_cls" in report
+
+
 def test_the_shipped_network_runs_and_is_scored(call, drives, tmp_path):
-    call(*command("run", drives / "sequences" / "05", "--model", "rcnn_small", "--out", tmp_path / "out"))
+    call(*command("run", drives / "sequences" / "05", "--model", "all_round", "--out", tmp_path / "out"))
     trajectory = tmp_path / "out" / "trajectory.txt"
     assert np.loadtxt(trajectory).shape == (60, 12)
     options = ("--planar", "--lengths", "10,20", "--json")

@@ -311,7 +311,7 @@ def test_simulate_writes_what_the_simulator_gives(tmp_path, capsys):
     assert main(["simulate", "--out", str(tmp_path / "out"), *options]) == 0
     assert capsys.readouterr().out == (
         f"wrote 00, my drive to {tmp_path}/out; score a trained network there: "
-        f'python evaluate.py data=kitti data.root={tmp_path}/out \'data.test=["00", "my drive"]\'\n'
+        f'rcnn-odom evaluate data=kitti data.root={tmp_path}/out \'data.test=["00", "my drive"]\'\n'
     )
     for name in ("00", "my drive"):
         made = simulated.load(name, frames=3, seed=7, movers=False)
@@ -411,7 +411,7 @@ def test_what_is_printed_to_be_copied_is_quoted(tmp_path, capsys):
     printed = capsys.readouterr().out.strip()
     words = shlex.split(printed)
     assert str(folder) in [word.rstrip(";") for word in words]
-    overrides = OverridesParser.create().parse_overrides(words[words.index("evaluate.py") + 1 :])
+    overrides = OverridesParser.create().parse_overrides(words[words.index("evaluate") + 1 :])
     assert {override.key_or_group: override.value() for override in overrides[:3]} == {
         "data": "kitti",
         "data.root": str(folder),

@@ -215,11 +215,11 @@ def test_the_command_is_hydras(bare):
     (bare / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": overrides}}))
     make_report(bare)
     origin = section((bare / "report.md").read_text(), "Where it comes from")
-    command = "python train.py -m hydra/launcher=joblib +sweeps=kernel_size 'data.val=[c[:0.5]]'"
+    command = "rcnn-odom train -m hydra/launcher=joblib +sweeps=kernel_size 'data.val=[c[:0.5]]'"
     assert f"The last command for this folder:\n\n    {command}\n" in origin
-    alone = "    python train.py model=cnn_cls model.kernel_size=5 seed=2"
+    alone = "    rcnn-odom train model=cnn_cls model.kernel_size=5 seed=2"
     assert alone in origin.split("Each run alone:\n\n")[1].splitlines()
-    assert len(re.findall("    (python.*)", origin)) == 1 + 6
+    assert len(re.findall("    (rcnn-odom train.*)", origin)) == 1 + 6
 
 
 @pytest.mark.parametrize(
@@ -264,7 +264,7 @@ def test_other_versions_are_told(tmp_path):
     text = (tmp_path / "report.md").read_text()
     assert "> **Warning: the runs were made with different versions of torch.**" in text
     assert "torch 2.13.0 and 2.14" in text
-    commands = "    python train.py seed=0\n    python train.py seed=1\n"
+    commands = "    rcnn-odom train seed=0\n    rcnn-odom train seed=1\n"
     assert f"Each run alone:\n\n{commands}" in text
 
 

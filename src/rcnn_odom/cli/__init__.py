@@ -1,4 +1,4 @@
-"""`rcnn-odom ...`: jobs on files that are not experiments, one file a command."""
+"""`rcnn-odom ...`: one file a command."""
 
 import argparse
 import os
@@ -6,12 +6,16 @@ import sys
 from collections.abc import Sequence
 
 from rcnn_odom import __version__
-from rcnn_odom.cli import drift, export, frames, relations, report, run, simulate
+from rcnn_odom.cli import drift, evaluate, export, frames, relations, report, run, simulate, train
 from rcnn_odom.cli.arguments import join_signed
+from rcnn_odom.cli.full import add_missing, is_full
 from rcnn_odom.errors import InputError
-from rcnn_odom.training.terminal import show_any_text
+from rcnn_odom.terminal import show_any_text
 
 # Heavy imports stay inside the commands, so that --help answers at once.
+
+FULL = {"train": train, "evaluate": evaluate, "report": report, "export": export}
+"""Commands that a robot goes without."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -43,9 +47,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _build_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(prog="rcnn-odom", description="Jobs on files of laser odometry.")
+    parser = argparse.ArgumentParser(prog="rcnn-odom", description="Odometry from a 2D laser.")
     parser.add_argument("--version", action="version", version=f"rcnn-odom {__version__}")
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
-    for command in (drift, frames, relations, simulate, report, export, run):
+    for command in (run, drift, frames, relations, simulate):
         command.add(commands)
+    for name, command in FULL.items():
+        command.add(commands) if is_full() else add_missing(commands, name)
     return parser

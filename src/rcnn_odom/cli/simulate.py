@@ -7,7 +7,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from rcnn_odom.cli.arguments import Subcommands, whole_number
-from rcnn_odom.training.overrides import written
+from rcnn_odom.cli.full import is_full
 
 
 def add(commands: Subcommands) -> None:
@@ -88,9 +88,18 @@ def _run_simulate(arguments: argparse.Namespace) -> int:
             tilt="tilt" not in arguments.without,
         )
         export_kitti(sequence, root)
-    tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
-    command = f"python evaluate.py data=kitti {written('data.root', str(root))} {tests}"
-    for option, value in simulated.SENSORS[arguments.world].items():
-        command += f" data.sensor.{option}={value:g}"
-    print(f"wrote {', '.join(names)} to {shlex.quote(str(root))}; score a trained network there: {command}")
+    told = f"wrote {', '.join(names)} to {shlex.quote(str(root))}"
+    if is_full():
+        command = _scoring(root, names, simulated.SENSORS[arguments.world])
+        told += f"; score a trained network there: {command}"
+    print(told)
     return 0
+
+
+def _scoring(root: Path, names: list[str], sensor: dict[str, float]) -> str:
+    """The command that scores a network on the drives, as it is typed."""
+    from rcnn_odom.training.overrides import written
+
+    tests = shlex.quote(f"data.test={json.dumps(names, ensure_ascii=False)}")
+    command = f"rcnn-odom evaluate data=kitti {written('data.root', str(root))} {tests}"
+    return command + "".join(f" data.sensor.{option}={value:g}" for option, value in sensor.items())

@@ -27,10 +27,10 @@ from rcnn_odom.geometry import motions_of
 from rcnn_odom.models.cnn import CHANNELS, STRIDES
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.losses import regression_loss
+from rcnn_odom.training.entry import CONF
 from rcnn_odom.training.settings import plain
 from rcnn_odom.training.stages import build_datamodule, build_module, build_trainer
 
-CONF = Path(__file__).parents[3] / "conf"
 CASES = {"CNN, batches of 64": "cnn_reg", "RCNN, 16 windows of 16": "rcnn_reg"}
 """Model by name, with the recipe's batches."""
 ROUNDS, WARM_UP, SECONDS = 3, 3, 6.0
@@ -75,7 +75,7 @@ def settings_of(model: str, precision: str, outputs: str) -> Settings:
     options = [f"model={model}", f"trainer.precision={precision}", "trainer.accelerator=cpu"]
     options += [f"data.frames={FRAMES}", "data.train=['00']", "data.val=['10']", "data.test=['10']"]
     options += ["data.fresh_worlds=false", f"outputs={outputs}", f"run_dir={outputs}/run"]
-    with initialize_config_dir(str(CONF), version_base="1.3"):
+    with initialize_config_dir(CONF, version_base="1.3"):
         return plain(compose("config", options))
 
 

@@ -20,12 +20,12 @@ from omegaconf.errors import OmegaConfBaseException
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import ERROR
+from rcnn_odom.terminal import show_any_text
 from rcnn_odom.training import cluster
 from rcnn_odom.training.overrides import explain, is_path, read_paths, written
 from rcnn_odom.training.run_state import find_stopped
 from rcnn_odom.training.settings import RENAMED, plain
 from rcnn_odom.training.sweep import folder_name
-from rcnn_odom.training.terminal import show_any_text
 from rcnn_odom.training.trainer_options import refusal
 
 log = logging.getLogger(__name__)
@@ -34,8 +34,8 @@ Result = TypeVar("Result")
 
 NO_JOB_SUCCEEDED = "No trials are completed yet."
 """What Optuna says at the end of a sweep whose jobs have all failed."""
-HYDRAS_OWN = "Config group override"
-"""How Hydra's complaint about ``model=null`` begins, which is a plain ValueError."""
+HYDRAS_OWN = ("Config group override", "Only one of --run")
+"""How those of Hydra's complaints begin that are plain ValueErrors: ``model=null``, ``-m`` with ``--cfg``."""
 
 _failed: list[Exception] = []
 

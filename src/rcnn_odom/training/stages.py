@@ -60,7 +60,7 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
     data, model = settings["data"], settings["model"]
     cache = Path(settings["outputs"]) / "cache"
     recordings = open_recording(data["reader"])
-    if data["reader"].get("reference") == MATCHER:
+    if MATCHER in (reader.get("reference") for reader in [data["reader"], *data.get("sources", {}).values()]):
         recordings = MatcherTruth(recordings, cache, data["deskew"])
     recipe = {key: model[key] for key in ("window", "batch_size", "stride", "repeat") if key in model}
     return OdometryDataModule(
@@ -183,7 +183,7 @@ def train(settings: Settings, *, reuse: bool = False) -> Report | None:
     settings, variant = settings | {"run_dir": str(run)}, settings["model"]["variant"]
     if not find_model(variant).trains:
         raise InputError(
-            f"model={variant} has nothing to train; score it: python evaluate.py model={variant} data=..."
+            f"model={variant} has nothing to train; score it: rcnn-odom evaluate model={variant} data=..."
         )
     if reuse and state_of(run, settings).state is State.FINISHED:
         log.info("run %s is finished already", run)

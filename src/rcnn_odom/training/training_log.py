@@ -11,7 +11,7 @@ import torch
 from lightning.pytorch.callbacks import Callback
 
 from rcnn_odom.evaluation.metrics import all_metrics
-from rcnn_odom.training.terminal import show_any_text
+from rcnn_odom.terminal import show_any_text
 
 log = logging.getLogger(__name__)
 # Lightning logs facts about the machine and advertises products; this project logs what a user needs.

@@ -119,7 +119,7 @@ def read_sweep(
     if not runs:
         only_scores = ", only evaluations of other runs" if found else ""
         raise InputError(
-            f"{directory}: no run in it{only_scores}; train some, for instance python train.py -m seed=0,1,2"
+            f"{directory}: no run in it{only_scores}; train some, for instance rcnn-odom train -m seed=0,1,2"
         )
     folders = {run.name for run in everything}
     missing = [name for name in expected or () if name not in folders]

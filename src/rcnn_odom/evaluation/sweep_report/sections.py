@@ -279,6 +279,6 @@ def _commands(sweep: Sweep) -> list[str]:
         titles = {"The last command for this folder": [("-m", *map(str, words))], **titles}
     lines = []
     for title, commands in titles.items():
-        shown = dict.fromkeys("    " + shlex.join(["python", "train.py", *options]) for options in commands)
+        shown = dict.fromkeys("    " + shlex.join(["rcnn-odom", "train", *options]) for options in commands)
         lines += [f"{title}:", "\n".join(shown)] if shown else []
     return lines
