@@ -15,7 +15,9 @@ class Cause(NamedTuple):
     advice: str
 
 
-HELP_MATCHER = "give the wheels' odometry if there is one (--wheels, --odom-topic); in a tunnel try --model fused"
+HELP_MATCHER = (
+    "give the wheels' odometry if there is one (--wheels, --odom-topic); in a tunnel try --model fused"
+)
 
 CAUSES = {
     "no returns": Cause(
