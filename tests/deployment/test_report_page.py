@@ -99,6 +99,13 @@ def page_of(folder, tracker, stream, settings=None):
     return Page(folder / "report.html"), summary
 
 
+def test_a_stream_whose_first_scans_have_no_stamp_has_its_page(tmp_path):
+    rows = (Scan(np.full(181, 5.0), ANGLES, stamp=100 + 0.1 * n if n > 2 else None) for n in range(40))
+    page, summary = page_of(tmp_path / "out", Tracker({}), ScanStream("late.jsonl", rows))
+    assert summary["recording_s"] == pytest.approx(3.6)
+    assert len(page.links) >= 4
+
+
 @pytest.fixture(scope="module")
 def toy(tmp_path_factory):
     """A run of 12 seconds with two kinds of trouble, its page and its summary."""
@@ -227,7 +234,7 @@ def test_a_long_drive_stays_small(tmp_path):
         timeline.add(pose)
         if number % 8 == 0:
             points = rng.uniform(-60, 60, (181, 2)).astype(np.float32)
-            seen.append(Seen((pose.x, pose.y, pose.heading), points, 0.1 * number))
+            seen.append(Seen((pose.x, pose.y, pose.heading), points, number, 0.1 * number))
     end = {"x": pose.x, "y": pose.y, "heading": pose.heading}
     summary = {"input": "long", "model": "toy", "laser_pose": None, "scans": 13_000, "path_m": 1300.0}
     summary |= {"latency": {"median_ms": 1.0}, "recording_s": 1300.0, "end": end, "skipped": {}}

@@ -167,6 +167,11 @@ def test_what_is_there_is_not_overwritten(model, tmp_path, capsys):
     assert main(command) == 1
     assert "holds a trajectory already; choose another --out" in capsys.readouterr().err
     assert (tmp_path / "out" / "trajectory.txt").read_bytes() == before
+    (tmp_path / "other").mkdir()
+    (tmp_path / "other" / "report.html").write_text("of somebody else")
+    assert main([*command[:-1], str(tmp_path / "other")]) == 1
+    assert "holds report.html already; choose another --out" in capsys.readouterr().err
+    assert [path.name for path in (tmp_path / "other").iterdir()] == ["report.html"]
     command[-1] = str(tmp_path / "robot.log" / "out")
     assert main(command) == 1
     assert "cannot be written" in capsys.readouterr().err

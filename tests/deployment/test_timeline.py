@@ -16,6 +16,7 @@ from rcnn_odom.deployment.timeline import (
     causes_in,
 )
 from rcnn_odom.geometry import Step
+from rcnn_odom.models.fused import _without_prior
 
 
 def seconds_of(*stamps):
@@ -123,6 +124,7 @@ def test_causes_are_what_stands_before_a_colon():
     fused = "no prior: other laser: its beams lie elsewhere; scan matching goes on alone"
     assert causes_in(fused) == ["no prior"]
     assert causes_in("gap: 3 periods after the last scan; few returns: 2 %") == ["gap", "few returns"]
+    assert causes_in(_without_prior(("few returns: 2 %", "gap: 3 periods"))[0]) == ["no prior"]
     assert causes_in("") == []
 
 

@@ -460,7 +460,14 @@ def test_a_drive_goes_on_where_the_place_is_not_known(monkeypatch):
     """As in a stream: the last motion, of which nobody knows how wrong it is."""
     network = CNNWarp(OPTIONS, SENSOR)
     told = [Step(1.0, 0.0, 0.1, np.eye(3)), Step(*[math.nan] * 3), Step(2.0, 0.0, 0.0, np.eye(3))]
-    monkeypatch.setattr(network, "stepper", lambda: lambda pair: told.pop(0))
+
+    class Told:
+        description = network.describe()
+
+        def __call__(self, pair):
+            return told.pop(0)
+
+    monkeypatch.setattr(network, "stepper", Told)
     steps = network.estimate_scans(torch.zeros(4, SENSOR.bins))
     assert steps.values[:, 0].tolist() == [1.0, 1.0, 2.0]
     assert np.isnan(steps.covariances[1]).all()

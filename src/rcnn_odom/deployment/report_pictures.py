@@ -37,12 +37,14 @@ class Seen(NamedTuple):
     Attributes:
         pose: x, y in metres and heading in radians.
         points: (P, 2) metres, in the frame of the first pose.
-        time: seconds of the recording, or the number of the scan where it has no clock.
+        scan: its number.
+        seconds: of the recording, 0 before its first stamp.
     """
 
     pose: tuple[float, float, float]
     points: npt.NDArray[np.float32]
-    time: float
+    scan: int
+    seconds: float
 
 
 class Picture(NamedTuple):
@@ -112,9 +114,9 @@ def _clock(timeline: Timeline) -> str:
 
 def _map(timeline: Timeline, seen: Sequence[Seen], path: str) -> Picture:
     end, nothing = timeline.end, np.empty((0, 2), np.float32)
-    now = float(timeline.scans) if timeline.seconds is None else timeline.seconds
-    seen = [*seen, Seen((end.x, end.y, end.heading), nothing, now)]  # the last scan need not be among them
-    poses, times = np.array([one.pose for one in seen]), np.array([one.time for one in seen])
+    # The last scan need not be among them.
+    seen = [*seen, Seen((end.x, end.y, end.heading), nothing, timeline.scans, timeline.seconds or 0.0)]
+    poses, times = np.array([one.pose for one in seen]), _times_of(timeline, seen)
     caption = (
         "The scans laid where they were taken, seen from above; at the start it looks up the page. Thin "
         "walls mean poses that agree with each other; doubled or blurred walls mean poses that do not. The "
@@ -199,6 +201,11 @@ def _picture(timeline: Timeline, heading: str, caption: str, alt: str, panels: S
     return Picture(heading, caption, alt, lambda: _time_figure(timeline, panels))
 
 
+def _times_of(timeline: Timeline, seen: Sequence[Seen]) -> FloatArray:
+    """When the scans were taken: seconds, or their numbers where there is no clock."""
+    return np.array([one.scan if timeline.seconds is None else one.seconds for one in seen], dtype=float)
+
+
 def _time_figure(timeline: Timeline, panels: Sequence[Panel]) -> "Figure":
     has_clock = timeline.seconds is not None
     times = timeline.curves.column("seconds" if has_clock else "scan")
@@ -209,8 +216,9 @@ def _time_figure(timeline: Timeline, panels: Sequence[Panel]) -> "Figure":
             axes.plot(times, values, style, color=INK, linewidth=1.1, label=name or None)
         axes.set_ylabel(panel.label)
         axes.grid(alpha=0.3)
-        margin = 0.02 * max(times[-1] - times[0], 1e-3)
-        axes.set_xlim(times[0] - margin, times[-1] + margin)  # also where a curve begins later
+        known = times[np.isfinite(times)]  # scans before the first stamp have none
+        margin = 0.02 * max(known[-1] - known[0], 1e-3)
+        axes.set_xlim(known[0] - margin, known[-1] + margin)  # also where a curve begins later
         _set_scale(axes, panel)
         _shade(axes, timeline, has_clock)
     rows[-1, 0].set_xlabel(_clock(timeline))

@@ -195,9 +195,8 @@ class Statistics:
     def _look(self, pose: Pose) -> None:
         """Keeps what the report shows of a pose."""
         self.timeline.add(pose)
-        seconds = self.timeline.seconds
-        time_of_it = float(self.scans) if seconds is None else seconds
-        self.sample.add(lambda: Seen((pose.x, pose.y, pose.heading), self.odometer.returns(), time_of_it))
+        scan, seconds = self.scans, self.timeline.seconds or 0.0
+        self.sample.add(lambda: Seen((pose.x, pose.y, pose.heading), self.odometer.returns(), scan, seconds))
 
     def require_usable_scans(self) -> None:
         """Looks at the end whether anything could be used.
@@ -290,15 +289,16 @@ class OutputFolder:
         stack: closes the files of lines.
 
     Raises:
-        InputError: the folder holds a trajectory already.
+        InputError: the folder holds such files already.
     """
 
     def __init__(self, folder: Path, stream: ScanStream, camera: FloatArray, stack: ExitStack) -> None:
         self.folder, self.stream, self.camera = folder, stream, camera
         self._stack, self._written = stack, 0
         self._made = [each for each in (folder, *folder.parents) if not each.exists()]
-        if (folder / TRAJECTORY).exists():
-            raise InputError(f"{folder}: holds a trajectory already; choose another --out")
+        if found := [name for name in (TRAJECTORY, TUM, STEPS, PAGE, SUMMARY) if (folder / name).exists()]:
+            what = "a trajectory" if found[0] == TRAJECTORY else found[0]
+            raise InputError(f"{folder}: holds {what} already; choose another --out")
 
     def _begin(self) -> None:
         try:

@@ -51,7 +51,8 @@ def _speed(summary: Mapping[str, Any]) -> str:
     times, speed = summary["latency"], summary["speed"]
     computed = f"{_round(times['median_ms'])} ms a scan"
     if not speed:
-        return f"{computed}; the scans have no time stamps, so that no speed is known"
+        why = "have no time stamps" if summary["recording_s"] is None else "are of one moment"
+        return f"{computed}; the scans {why}, so that no speed is known"
     share = 1e3 * summary["recording_s"] / (times["median_ms"] * summary["scans"])
     return (
         f"{computed}, {_round(share)} times as fast as the recording (reading it aside); the robot "

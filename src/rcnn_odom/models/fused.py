@@ -139,7 +139,7 @@ def make_prior(told: Step, held: Prior) -> Prior:
 
 def _without_prior(notes: tuple[str, ...]) -> tuple[str, ...]:
     """Why there is no step of the network, in one note."""
-    return (f"{NO_PRIOR}: {'; '.join(notes)}; scan matching goes on alone",)
+    return (f"{NO_PRIOR}: {', '.join(notes)}, and scan matching goes on alone",)
 
 
 class FusedTracker(MatcherTracker):

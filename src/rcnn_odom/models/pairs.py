@@ -165,13 +165,13 @@ class PairTracker:
 def estimate_pairs(stepper: Stepper, pairs: Iterable[npt.NDArray[np.float32]]) -> Steps:
     """The steps of a row of pairs of encoded scans (2, bins), of which each begins where the last one ends.
 
-    Where the stepper does not know the place (nan), the last motion goes on, as in :class:`PairTracker`, with
-    an unknown covariance.
+    Where one that draws its scans does not know the place (nan), the last motion goes on with an unknown
+    covariance; it has begun again by itself.
     """
     steps: list[Step] = []
     for pair in pairs:
         step = stepper(pair)
-        if not np.isfinite(step.array()).all():
+        if stepper.description.warping and not np.isfinite(step.array()).all():
             last = steps[-1] if steps else Step(0.0, 0.0, 0.0)
             step = replace(last, covariance=unknown_covariance())
         steps.append(step)
