@@ -34,6 +34,7 @@ def seconds_of(*stamps):
         ((100.0, 100.5, 100.2, 101.0), [0, 0.5, 0.5, 1]),  # a late scan
         ((0.0, 0.1, 1.6e9, 1.6e9 + 1), [0, 0.1, 0.1, 1.1]),  # a clock that is set
         ((1.6e9, 1.6e9 + 1, 5.0, 6.0), [0, 1, 1, 2]),
+        ((9.0, 10.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), [0, 1, 1, 1, 1, 1, 1, 2]),  # set back by eight seconds
         ((None, None, 5.0, None, 6.0), [None, None, 0, 0, 1]),
         ((None, math.nan), [None, None]),
     ],

@@ -10,7 +10,7 @@ import numpy as np
 
 from rcnn_odom.deployment.odometer import Pose
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.recordings.clock import CLOCK_JUMP
+from rcnn_odom.recordings.clock import CLOCK_JUMP, LATE_IN_A_ROW
 
 MOMENTS = 2400
 """Points of a curve that are kept, about two for each dot of a picture."""
@@ -41,7 +41,7 @@ class RecordingTime:
 
     def __init__(self) -> None:
         self.seconds: float | None = None
-        self._latest = 0.0
+        self._latest, self._late = 0.0, 0
 
     def add(self, stamp: float | None) -> None:
         """The stamp of one more scan, in seconds; None where it has none."""
@@ -51,7 +51,11 @@ class RecordingTime:
         if self.seconds is None or abs(passed) > CLOCK_JUMP:
             self.seconds, self._latest = self.seconds or 0.0, stamp
         elif passed > 0:
-            self.seconds, self._latest = self.seconds + passed, stamp
+            self.seconds, self._latest, self._late = self.seconds + passed, stamp, 0
+        else:
+            self._late += 1
+            if self._late == LATE_IN_A_ROW:  # the clock was set back, by little
+                self._latest, self._late = stamp, 0
 
 
 class RecentMotion:
