@@ -100,7 +100,8 @@ def run(
                     output.add(pose, scan)
             statistics.require_usable_scans()
         except BaseException as error:
-            statistics.stopped = str(error) or type(error).__name__
+            by_hand = isinstance(error, KeyboardInterrupt)
+            statistics.stopped = "by Ctrl-C" if by_hand else str(error) or type(error).__name__
             raise
         finally:
             if folder:

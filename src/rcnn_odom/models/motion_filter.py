@@ -75,8 +75,8 @@ class MotionFilter:
         expected = pose + motion + both + both.T
         turn = float(self.motion[2])
         measured = turn_covariance(covariance, turn)  # told of the frame of the scan before, as all here
-        gain = expected @ np.linalg.inv(expected + measured)
-        of_motion = (both.T + motion) @ np.linalg.inv(expected + measured)
+        inverse = np.linalg.inv(expected + measured)
+        gain, of_motion = expected @ inverse, (both.T + motion) @ inverse
         rest = np.eye(3) - gain
         cross = gain @ both @ rest.T
         step = gain @ (pose + measured) @ gain.T + rest @ motion @ rest.T - cross - cross.T
