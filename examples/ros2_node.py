@@ -19,9 +19,8 @@ from dataclasses import replace
 
 from rcnn_odom.cli.full import need_full
 from rcnn_odom.deployment.odometer import Odometer, Pose
-from rcnn_odom.deployment.ros_messages import ros_covariance
+from rcnn_odom.deployment.ros_messages import ros_covariance, velocity_of
 from rcnn_odom.errors import InputError
-from rcnn_odom.geometry import turn_to_middle, unknown_covariance
 from rcnn_odom.models.tracking import PASSED_OVER
 from rcnn_odom.recordings.rosbag import convert
 
@@ -32,13 +31,10 @@ def fill(message, pose: Pose, seconds: float) -> None:
     message.pose.pose.orientation.z = math.sin(pose.heading / 2)
     message.pose.pose.orientation.w = math.cos(pose.heading / 2)
     fill_covariance(message.pose.covariance, pose.covariance)
-    if seconds > 0:
-        step, twist = turn_to_middle(pose.step), message.twist.twist  # in the child's own frame
-        twist.linear.x, twist.linear.y = step.x / seconds, step.y / seconds
-        twist.angular.z = step.heading / seconds
-        fill_covariance(message.twist.covariance, step.covariance / seconds**2)
-    else:
-        fill_covariance(message.twist.covariance, unknown_covariance())
+    velocity, covariance = velocity_of(pose.step, seconds)  # in the child's own frame
+    twist = message.twist.twist
+    twist.linear.x, twist.linear.y, twist.angular.z = velocity
+    fill_covariance(message.twist.covariance, covariance)
 
 
 def fill_covariance(values, covariance) -> None:

@@ -15,7 +15,7 @@ from matching.rooms import BOX, cast, circle
 from outputs import Ahead, breaks_off, room_scans, stream_of
 from rcnn_odom.cli import main
 from rcnn_odom.deployment.odometer import Odometer
-from rcnn_odom.deployment.output import LocalMaps, OutputFile, Remarks, Stamps
+from rcnn_odom.deployment.output import LocalMaps, OutputFile, Remarks, Stamps, thinned
 from rcnn_odom.deployment.run import run
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.scan import Scan
@@ -205,3 +205,11 @@ def test_neither_rosbags_nor_rerun_is_loaded_unless_it_is_asked_for(tmp_path):
     code = f"""import sys; from rcnn_odom.cli import main; main({command!r})
 assert not {{"rosbags", "rerun"}} & sys.modules.keys()"""
     subprocess.run([sys.executable, "-c", code], check=True, cwd=ROOT)
+
+
+@pytest.mark.parametrize(("count", "left"), [(0, 0), (1, 1), (500, 500), (501, 251), (999, 500), (1001, 334)])
+def test_thinned_points_are_never_more_than_asked_for(count, left):
+    points = np.arange(2.0 * count, dtype=np.float32).reshape(-1, 2)
+    kept = thinned(points, 500)
+    assert len(kept) == left
+    assert np.array_equal(kept, points[:: max(1, round(count / max(left, 1)))])

@@ -172,6 +172,18 @@ def test_what_cannot_be_written_is_one_line_before_anything_is_read(
     assert [each.name for each in tmp_path.iterdir()] == ["there.rrd"]
 
 
+def test_a_file_that_cannot_be_completed_is_told_of(tmp_path, monkeypatch):
+    """A disk that is full at the end, as rerun tells it."""
+
+    def full(self, **options):
+        raise RuntimeError("no space left")
+
+    output = RerunFile(tmp_path / "out.rrd")
+    monkeypatch.setattr("rerun.RecordingStream.flush", full)
+    with pytest.raises(OSError, match="out.rrd: no space left"):
+        run(Odometer(Ahead()), stream_of(room_scans(5)), "ahead", outputs=[output])
+
+
 def test_what_rerun_itself_cannot_write_is_one_line(tmp_path):
     path = tmp_path / ("x" * 300 + ".rrd")
     with pytest.raises(InputError, match=r"cannot be written \(.*\); choose another --rerun") as refused:

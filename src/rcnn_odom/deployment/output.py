@@ -190,6 +190,15 @@ class Remarks:
         return remarks
 
 
+def thinned(points: npt.NDArray[np.float32], most: int) -> npt.NDArray[np.float32]:
+    """Every so many of points (P, 2), that at most ``most`` are left.
+
+    >>> thinned(np.zeros((10, 2), np.float32), 4).shape
+    (4, 2)
+    """
+    return points[:: max(1, -(-len(points) // most))]
+
+
 class LocalMaps:
     """The local map that outputs draw: the matcher's own, or else the returns of recent scans.
 
@@ -206,8 +215,7 @@ class LocalMaps:
         """Points (C, 2) in metres in the frame of the first pose, after one more scan; None: not yet due."""
         number, self._count = self._count, self._count + 1
         if not self._has_own and number % RECENT_EVERY == 0:
-            returns = self._odometer.returns()
-            self._recent.append(returns[:: 1 + len(returns) // RECENT_POINTS])
+            self._recent.append(thinned(self._odometer.returns(), RECENT_POINTS))
         if number % MAP_EVERY:
             return None
         return self._odometer.local_map() if self._has_own else np.concatenate(list(self._recent))

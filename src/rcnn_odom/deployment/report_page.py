@@ -16,8 +16,6 @@ from rcnn_odom.files import write_atomically
 log = logging.getLogger(__name__)
 
 Summary = Mapping[str, Any]
-MARK = "rcnn-odom run"
-"""Written into the page, by which it is known as one."""
 NO_PICTURES = "report.html has no pictures: they need matplotlib (pip install matplotlib)"
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f23; --paper: #ffffff; --line: #d5d9de; --soft: #f4f6f8;
@@ -81,7 +79,7 @@ def write_page(
 def _as_page(title: str, body: str) -> str:
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
-        f'<meta name="generator" content="{MARK}">\n'
+        '<meta name="generator" content="rcnn-odom run">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
         f"<title>{html.escape(title)}</title>\n<style>{STYLE}</style>\n</head>\n<body>\n{body}\n"
         "</body>\n</html>\n"

@@ -3,6 +3,7 @@
 import importlib.util
 import os
 import sys
+from abc import ABC, abstractmethod
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -45,7 +46,7 @@ BATCH_ROWS, BATCH_BYTES, BATCH_SECONDS = 1000, 1 << 20, 5.0
 COLORS = {"scan": (255, 140, 0), PATH: (80, 160, 255), MAP: (150, 150, 150), ELLIPSE: (230, 60, 120)}
 
 
-class RerunLog:
+class RerunLog(ABC):
     """Scans, path, local map, ellipses of three standard deviations and marks, as they come.
 
     Scans that are passed over, whose pose is the last one again, are told in the marks alone.
@@ -93,19 +94,25 @@ class RerunLog:
             self._log(MAP, self._rerun.Points3D(_flat(seen)))
 
     def finish(self, keep: bool) -> None:
-        """Waits until all of it has arrived."""
+        """Waits until all of it has arrived.
+
+        Raises:
+            OSError: a file can no longer be written.
+        """
         if self._recording is not None:
-            with suppress(RuntimeError):  # nobody looks any more
-                self._recording.flush(timeout_sec=PATIENCE)
+            self._flush()
             self._recording.disconnect()
 
+    def _flush(self) -> None:
+        self._recording.flush(timeout_sec=PATIENCE)
+
+    @abstractmethod
     def _begin(self) -> Any:
         """The recording, connected to where it goes to.
 
         Raises:
             InputError: there is no way to there.
         """
-        raise NotImplementedError
 
     def _new_recording(self, **options: Any) -> Any:
         recording = self._rerun.RecordingStream("rcnn-odom", **options)
@@ -211,10 +218,20 @@ class RerunFile(RerunLog):
         return recording
 
     def finish(self, keep: bool) -> None:
-        """Completes the file, or removes it."""
+        """Completes the file, or removes it.
+
+        Raises:
+            OSError: it can no longer be written.
+        """
         super().finish(keep)
         if self._recording is not None and not keep:
             self._file.remove()
+
+    def _flush(self) -> None:
+        try:
+            super()._flush()
+        except RuntimeError as error:
+            raise OSError(f"{self._file.path}: {error}") from error
 
 
 class RerunViewer(RerunLog):
@@ -233,6 +250,10 @@ class RerunViewer(RerunLog):
                 f"{VIEW_OPTION}: no display (neither DISPLAY nor WAYLAND_DISPLAY is set); write a file "
                 f"instead, {FILE_OPTION} out.rrd, and open it where there is one"
             )
+
+    def _flush(self) -> None:
+        with suppress(RuntimeError):  # nobody looks any more
+            super()._flush()
 
     def _begin(self) -> Any:
         recording = self._new_recording()

@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.deployment.odometer import Pose
-from rcnn_odom.geometry import FloatArray, turn_to_middle, unknown_covariance
+from rcnn_odom.geometry import FloatArray, Step, turn_to_middle, unknown_covariance
 from rcnn_odom.recordings.scan import Scan
 
 ODOMETRY, PATH, TRANSFORMS = "nav_msgs/msg/Odometry", "nav_msgs/msg/Path", "tf2_msgs/msg/TFMessage"
@@ -73,6 +73,24 @@ def serialize(message: Any, kind: str) -> bytes:
     return bytes(typestore().serialize_cdr(message, kind))
 
 
+def velocity_of(step: Step, seconds: float) -> tuple[Planar, FloatArray]:
+    """Velocity in metres and radians a second, in the frame in mid-turn, and its covariance (3, 3).
+
+    Args:
+        step: to the present pose.
+        seconds: that it took; not positive: the velocity is unknown, and 0.
+
+    Example:
+        >>> velocity_of(Step(0.2, 0.0, 0.0), 0.1)[0]
+        (2.0, 0.0, 0.0)
+    """
+    if seconds <= 0:
+        return (0.0, 0.0, 0.0), unknown_covariance()
+    middle = turn_to_middle(step)
+    x, y, turn = (middle.array() / seconds).tolist()
+    return (x, y, turn), middle.covariance / seconds**2
+
+
 def odometry(nanoseconds: int, frame: str, child: str, pose: Pose, seconds: float) -> Any:
     """A pose in ``frame`` with its accumulated covariance, and the velocity in ``child``.
 
@@ -82,11 +100,7 @@ def odometry(nanoseconds: int, frame: str, child: str, pose: Pose, seconds: floa
         pose: of the odometer.
         seconds: since the pose before; not positive: the velocity is unknown, and 0 in the message.
     """
-    velocity, of_velocity = np.zeros(3), unknown_covariance()
-    if seconds > 0:
-        step = turn_to_middle(pose.step)
-        velocity, of_velocity = step.array() / seconds, step.covariance / seconds**2
-    x, y, turn = velocity.tolist()
+    (x, y, turn), of_velocity = velocity_of(pose.step, seconds)
     twist = _geometry("Twist", _vector(x, y), _geometry("Vector3", 0.0, 0.0, turn))
     return typestore().types[ODOMETRY](
         header=_header(nanoseconds, frame),

@@ -17,7 +17,7 @@ from tqdm.contrib.logging import logging_redirect_tqdm
 
 from rcnn_odom import __version__
 from rcnn_odom.deployment.odometer import Odometer, Pose
-from rcnn_odom.deployment.output import Output
+from rcnn_odom.deployment.output import Output, thinned
 from rcnn_odom.deployment.report_page import write_page
 from rcnn_odom.deployment.report_pictures import Seen
 from rcnn_odom.deployment.sampling import EvenSample
@@ -33,8 +33,8 @@ from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
 TRAJECTORY, TUM, STEPS = "trajectory.txt", "trajectory.tum", "steps.jsonl"
 PAGE, SUMMARY = "report.html", "summary.json"
-MAP_SCANS = 2000
-"""Scans that a map is drawn of: 30 MB of a Velodyne's ring."""
+MAP_SCANS, MAP_POINTS = 2000, 2000
+"""Scans that a map is drawn of, and points of each: 32 MB at most."""
 LATENCIES = 100_000
 FEW_SCANS = 6
 """Fewer than so many need not have two that can be compared."""
@@ -197,7 +197,8 @@ class Statistics:
         """Keeps what the report shows of a pose."""
         self.timeline.add(pose)
         scan, seconds = self.scans, self.timeline.seconds or 0.0
-        self.sample.add(lambda: Seen((pose.x, pose.y, pose.heading), self.odometer.returns(), scan, seconds))
+        place, returns = (pose.x, pose.y, pose.heading), self.odometer.returns
+        self.sample.add(lambda: Seen(place, thinned(returns(), MAP_POINTS), scan, seconds))
 
     def require_usable_scans(self) -> None:
         """Looks at the end whether anything could be used.
