@@ -180,7 +180,7 @@ def test_a_file_that_cannot_be_completed_is_told_of(tmp_path, monkeypatch):
 
     output = RerunFile(tmp_path / "out.rrd")
     monkeypatch.setattr("rerun.RecordingStream.flush", full)
-    with pytest.raises(OSError, match="out.rrd: no space left"):
+    with pytest.raises(OSError, match=r"out\.rrd: no space left"):
         run(Odometer(Ahead()), stream_of(room_scans(5)), "ahead", outputs=[output])
 
 
