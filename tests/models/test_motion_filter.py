@@ -12,7 +12,10 @@ CHANGE, TYPICAL = np.array([0.05, 0.02, 0.003]), np.array([1.0, 0.05, 0.02])
 
 
 def textbook(measured, noise, change, first):
-    """Poses along x of a filter of position and velocity, written with its usual matrices."""
+    """Poses along x of a filter of position and velocity, written with its usual matrices.
+
+    Where nothing was measured, nan, it predicts alone.
+    """
     transition, seen = np.array([[1.0, 1.0], [0.0, 1.0]]), np.array([[1.0, 0.0]])
     state, covariance = np.zeros(2), np.diag([0.0, (2 * first) ** 2])
     poses = []
@@ -20,9 +23,10 @@ def textbook(measured, noise, change, first):
         # The velocity changes before it is driven.
         covariance = covariance + np.diag([0.0, change**2])
         state, covariance = transition @ state, transition @ covariance @ transition.T
-        gain = covariance @ seen.T / (seen @ covariance @ seen.T + noise**2)
-        state = state + gain[:, 0] * (place - state[0])
-        covariance = covariance - gain @ seen @ covariance
+        if not math.isnan(place):
+            gain = covariance @ seen.T / (seen @ covariance @ seen.T + noise**2)
+            state = state + gain[:, 0] * (place - state[0])
+            covariance = covariance - gain @ seen @ covariance
         poses.append((state[0], covariance[0, 0]))
     return np.array(poses)
 
@@ -38,6 +42,29 @@ def test_along_a_line_it_is_the_textbooks():
         pose = advance(guess, believed)
         got.append((pose[0], one.pose_covariance[0, 0]))
     assert np.allclose(got, expected, rtol=1e-6)
+
+
+@pytest.mark.parametrize("lost", [[7], [7, 8, 9, 10], [3, 12, 13, 20]])
+def test_scans_that_are_missing_or_show_nothing_are_the_textbooks_predictions(lost):
+    rng = np.random.default_rng(0)
+    measured = np.cumsum(1.0 + 0.05 * rng.standard_normal(30)) + 0.3 * rng.standard_normal(30)
+    measured[lost] = math.nan
+    expected = textbook(measured, 0.3, CHANGE[0], TYPICAL[0])
+    missing, empty = MotionFilter(CHANGE, TYPICAL), MotionFilter(CHANGE, TYPICAL)
+    poses, periods = [np.zeros(3), np.zeros(3)], 1
+    for place, textbook_pose in zip(measured, expected, strict=True):
+        if math.isnan(place):
+            periods += 1
+            poses[1] = advance(poses[1], empty.displacement())
+            empty.predict()
+            continue
+        for number, (one, so_many) in enumerate(((missing, periods), (empty, 1))):
+            guess = advance(poses[number], one.displacement(so_many))
+            residual = np.array([place - guess[0], 0.0, 0.0])
+            believed, _, _ = one.correct(residual, np.diag([0.09, 1e-4, 1e-6]), so_many)
+            poses[number] = advance(guess, believed)
+            assert np.allclose((poses[number][0], one.pose_covariance[0, 0]), textbook_pose, rtol=1e-6)
+        periods = 1
 
 
 def test_what_is_measured_surely_is_believed_whole():
@@ -63,8 +90,9 @@ def test_what_is_not_seen_goes_on_and_gets_less_sure():
     assert deviations[50] > 2 * deviations[0]
 
 
-def test_covariances_are_those_of_drawn_errors():
-    """Steps and poses beside a key of 3,000 drives that turn, by what they told before."""
+@pytest.mark.parametrize("periods", [(1, 1, 1, 1, 1, 1), (1, 1, 3, 1, 1, 2)])
+def test_covariances_are_those_of_drawn_errors(periods):
+    """Steps and poses beside a key of 3,000 drives that turn, over the deviations that the filter gave."""
     rng = np.random.default_rng(1)
     change, noise = np.array([0.03, 0.01, 0.004]), np.array([0.05, 0.2, 0.01])
     steps, poses = [], []
@@ -72,12 +100,14 @@ def test_covariances_are_those_of_drawn_errors():
         one = MotionFilter(change, TYPICAL)
         motion = 2 * TYPICAL * rng.standard_normal(3) * [1, 1, 0.2]
         true, pose = np.zeros(3), np.zeros(3)
-        for _ in range(6):
-            motion = motion + change * rng.standard_normal(3)
-            before_true, true = true, advance(true, motion)
-            guess = advance(pose, one.motion)
+        for so_many in periods:
+            before_true = true
+            for _ in range(so_many):
+                motion = motion + change * rng.standard_normal(3)
+                true = advance(true, motion)
+            guess = advance(pose, one.displacement(so_many))
             measured = advance(true, noise * rng.standard_normal(3))
-            believed, step, _ = one.correct(relative_step(guess, measured), np.diag(noise**2))
+            believed, step, _ = one.correct(relative_step(guess, measured), np.diag(noise**2), so_many)
             before, pose = pose, advance(guess, believed)
         steps.append(
             (relative_step(before, pose) - relative_step(before_true, true)) / np.sqrt(np.diag(step))

@@ -16,6 +16,7 @@ from rcnn_odom.geometry import (
     Steps,
     advance,
     compose,
+    poses_to_planar,
     relative_step,
 )
 from rcnn_odom.models.cnn_warp import FINE, CNNWarp, LocalConstraints, compare, invert, log_determinant
@@ -24,6 +25,7 @@ from rcnn_odom.models.pairs import PairTracker, as_used
 from rcnn_odom.models.rcnn_warp import RCNNWarp
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Description, Warping
+from rcnn_odom.models.tracking import Kind, Tracking
 from rcnn_odom.models.warping import WarpingStepper
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
@@ -221,24 +223,61 @@ def test_a_network_that_jumps_about_has_no_step():
     assert np.isnan(WarpingStepper(network)(scans[:2]).array()).all()
 
 
-def test_a_held_step_takes_nothing_back():
-    """The variance of a pose after an estimated and a held step is the sum of the two."""
-    own = np.diag([1e-6, 4e-6, 1e-8])
+def track(network, scans, stamps):
+    """The steps of a network to scans (bins,) of the room, by a tracker."""
+    bearings = np.deg2rad(SENSOR.first_bin_deg + np.arange(float(SENSOR.bins)))
+    tracking = Tracking(PairTracker(network))
+    return [
+        tracking.step(Scan(scan.astype(float), bearings, stamp=stamp))
+        for scan, stamp in zip(scans, stamps, strict=True)
+    ]
+
+
+@pytest.mark.parametrize("key_distance", [0.0, 0.3, 100.0])
+def test_scans_are_compared_across_a_gap(perfect, key_distance):
+    """Scans that were dropped, and scans without returns, cost a network that predicts nothing."""
+    scans, steps = drive(30)
+    stepper = perfect(scans, steps, key_distance=key_distance)
+    poses = stepper.network.poses
+    seen = [n for n in range(30) if n not in (8, 9, 15)]
+    scans[20:22] = 0.0
+    tracked = track(stepper, scans[seen], [0.1 * n for n in seen])
+    got = poses_to_planar(compose([each.step.array() for each in tracked[1:]]))
+    visible = [n not in (20, 21) for n in seen]
+    assert np.allclose(got[visible], np.array(poses)[seen][visible], atol=1e-5)
+    across = tracked[seen.index(10)]
+    assert across.kind is Kind.ESTIMATED
+    assert across.notes == ("gap: 3 periods after the last scan, compared across it",)
+    assert [tracked[seen.index(n)].kind for n in (20, 21, 22)] == [Kind.HELD, Kind.HELD, Kind.ESTIMATED]
+
+
+def test_over_a_longer_gap_the_motion_goes_on(perfect):
+    scans, steps = drive(30)
+    seen = [*range(8), *range(19, 30)]
+    tracked = track(perfect(scans, steps), scans[seen], [0.1 * n for n in seen])
+    assert tracked[8].kind is Kind.HELD
+    assert tracked[8].notes == ("gap: 12 periods after the last scan, the last motion goes on",)
+    assert np.allclose([each.step.array() for each in tracked[9:]], steps[19:], atol=1e-5)
+
+
+def test_the_variance_of_a_pose_grows_over_scans_without_returns_and_comes_back():
+    own, change = np.diag([1e-6, 4e-6, 1e-8]), np.array([3e-3, 1e-3, 5e-4])
 
     class Constant(Perfect):
         def __call__(self, pair):
             return Step(0.0, 0.0, 0.0, own)
 
     network = Constant(*drive(5), Warping(0.5, 1, 0.1, 0.05, 100.0, 20.0))
-    network.description = replace(network.description, typical_step=(3e-3, 1e-3, 5e-4))
-    tracker = PairTracker(network)
-    bearings = np.deg2rad(SENSOR.first_bin_deg + np.arange(360.0))
-    seen, empty = Scan(np.full(360, 5.0), bearings), Scan(np.full(360, np.inf), bearings)
-    tracker.begin(seen)
-    added = AccumulatedCovariance()
-    for scan in (seen, empty):
-        added.add(np.zeros(3), tracker.register(scan).step)
-    assert np.allclose(np.diag(added.value), np.diag(own) + np.square([3e-3, 1e-3, 5e-4]), rtol=1e-2)
+    network.description = replace(network.description, typical_step=(0, 0, 0), typical_change=tuple(change))
+    scans = [np.full(SENSOR.bins, 0.0 if n in (30, 31) else 5.0) for n in range(33)]
+    added, variances = AccumulatedCovariance(), []
+    for tracked in track(network, scans, 0.1 * np.arange(33)):
+        added.add(np.zeros(3), tracked.step)
+        variances.append(np.diag(added.value))
+    # One period later it is moved by the error of the motion, which the change alone adds up to less than.
+    assert np.all(variances[30] > variances[29] + change**2)
+    assert np.all(variances[31] > variances[30] + 3 * change**2)
+    assert np.allclose(variances[32], np.diag(own), rtol=0.2)
 
 
 def test_covariances_are_those_of_two_poses_and_what_comes_back(perfect):

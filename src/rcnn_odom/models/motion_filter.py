@@ -1,10 +1,34 @@
 """A Kalman filter of a motion that changes little from scan to scan; needs numpy alone."""
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
-from rcnn_odom.geometry import FloatArray, turn_covariance
+from rcnn_odom.geometry import FloatArray, advance, turn_covariance
+
+
+class _Predicted(NamedTuple):
+    """Covariances (3, 3) of the errors at a later scan, in the frame of the last one.
+
+    Attributes:
+        pose: of the pose beside the key if the motion were known.
+        moved: of the motion over the periods between.
+        pose_and_moved: of these two with each other.
+        motion: of the motion from scan to scan at the later scan.
+        pose_and_motion: of the pose there, with all its errors, and of that motion with each other.
+    """
+
+    pose: FloatArray
+    moved: FloatArray
+    pose_and_moved: FloatArray
+    motion: FloatArray
+    pose_and_motion: FloatArray
+
+    @property
+    def expected(self) -> FloatArray:
+        """Of the pose beside the key, with all its errors."""
+        return self.pose + self.moved + self.pose_and_moved + self.pose_and_moved.T
 
 
 class MotionFilter:
@@ -42,51 +66,78 @@ class MotionFilter:
         """(3, 3) of the last scan's pose beside the key, in the scan's own frame."""
         return self._errors[:3, :3].copy()
 
-    def weigh(self, residual: FloatArray, covariance: FloatArray) -> FloatArray:
-        """What of a residual (3,) would be believed: see :meth:`correct`, which also takes it in."""
-        pose, motion, both = self._predict()
-        expected, turn = pose + motion + both + both.T, float(self.motion[2])
+    def displacement(self, periods: int = 1) -> FloatArray:
+        """The motion (3,) over so many periods, in the frame of the last scan."""
+        moved = self.motion
+        for _ in range(periods - 1):
+            moved = advance(moved, self.motion)
+        return moved
+
+    def weigh(self, residual: FloatArray, covariance: FloatArray, periods: int = 1) -> FloatArray:
+        """The part of a residual (3,) that :meth:`correct` would believe; changes nothing."""
+        expected, turn = self._predict(periods).expected, float(self.displacement(periods)[2])
         gain = expected @ np.linalg.inv(expected + turn_covariance(covariance, turn))
         return _rotate(gain @ _rotate(residual, turn), -turn)
 
-    def _predict(self) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Covariances (3, 3) at the next scan: of the pose, of the motion, and of both together."""
-        motion = self._errors[3:, 3:] + np.diag(np.square(self._change))
-        # An error of the heading moves the place that the motion leads to.
-        x, y, _ = self.motion.tolist()
-        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
-        return lever @ self._errors[:3, :3] @ lever.T, motion, lever @ self._errors[:3, 3:]
+    def predict(self, periods: int = 1) -> tuple[FloatArray, FloatArray]:
+        """Moves on by so many periods in which nothing was measured.
+
+        Returns:
+            The covariance (3, 3) of the step, in the frame of the scan before; and the part of the pose's
+            (3, 3) that the next measurement takes back, which is all of it, in the new scan's own frame.
+        """
+        turn, predicted = float(self.displacement(periods)[2]), self._predict(periods)
+        self._keep(predicted.expected, predicted.pose_and_motion, predicted.motion, turn)
+        return predicted.moved, self.pose_covariance
 
     def correct(
-        self, residual: FloatArray, covariance: FloatArray
+        self, residual: FloatArray, covariance: FloatArray, periods: int = 1
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Takes what was measured at the next scan.
+        """Takes in what was measured at the next scan.
 
         Args:
             residual: (3,) where it was measured, seen from where it was expected.
             covariance: (3, 3) of that.
+            periods: from the last scan to this one.
 
         Returns:
-            What of the residual is believed (3,); the covariance (3, 3) of the step to the scan, in the frame
-            of the scan before; and the part of the pose's (3, 3) that the next measurement takes back, in the
-            scan's own frame.
+            The part of the residual that is believed (3,); the covariance (3, 3) of the step to the scan, in
+            the frame of the scan before; and the part of the pose's (3, 3) that the next measurement takes
+            back, in the scan's own frame.
         """
-        pose, motion, both = self._predict()
-        expected = pose + motion + both + both.T
-        turn = float(self.motion[2])
-        measured = turn_covariance(covariance, turn)  # told of the frame of the scan before, as all here
+        predicted, turn = self._predict(periods), float(self.displacement(periods)[2])
+        expected, cross = predicted.expected, predicted.pose_and_motion
+        measured = turn_covariance(covariance, turn)  # in the frame of the scan before, as all here
         inverse = np.linalg.inv(expected + measured)
-        gain, of_motion = expected @ inverse, (both.T + motion) @ inverse
+        gain, of_motion = expected @ inverse, cross.T @ inverse
         rest = np.eye(3) - gain
-        cross = gain @ both @ rest.T
-        step = gain @ (pose + measured) @ gain.T + rest @ motion @ rest.T - cross - cross.T
+        both = gain @ predicted.pose_and_moved @ rest.T
+        step = gain @ (predicted.pose + measured) @ gain.T + rest @ predicted.moved @ rest.T - both - both.T
         seen = _rotate(residual, turn)
         believed = _rotate(gain @ seen, -turn)
         after = turn + float(believed[2])
         self.motion = self.motion + of_motion @ seen
-        self._keep(rest @ expected, rest @ (both + motion), motion - of_motion @ (both + motion), after)
+        self._keep(rest @ expected, rest @ cross, predicted.motion - of_motion @ cross, after)
         taken = turn_covariance(gain @ rest @ expected, -after)
         return believed, step, (taken + taken.T) / 2
+
+    def _predict(self, periods: int) -> "_Predicted":
+        """The errors at a scan so many periods later."""
+        motion, change = self._errors[3:, 3:], np.diag(np.square(self._change))
+        # An error of the heading moves the place that the motion leads to.
+        x, y, _ = self.displacement(periods).tolist()
+        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        both = lever @ self._errors[:3, 3:]
+        # A change of the motion in the first of three periods counts three times, the next one twice, ...
+        once = periods * (periods + 1) / 2
+        squared = once * (2 * periods + 1) / 3
+        return _Predicted(
+            pose=lever @ self._errors[:3, :3] @ lever.T,
+            moved=periods**2 * motion + squared * change,
+            pose_and_moved=periods * both,
+            motion=motion + periods * change,
+            pose_and_motion=both + periods * motion + once * change,
+        )
 
     def _keep(self, pose: FloatArray, both: FloatArray, motion: FloatArray, turn: float) -> None:
         """The errors after a scan, told of its own frame, which is turned by so many radians."""

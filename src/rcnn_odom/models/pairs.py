@@ -3,7 +3,7 @@
 import math
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import cast
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -13,6 +13,9 @@ from rcnn_odom.models.encoding import decode
 from rcnn_odom.models.streaming import Network, Registered, Stepper
 from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.recordings.scan import Scan
+
+if TYPE_CHECKING:
+    from rcnn_odom.models.warping import WarpingStepper
 
 LONGEST_HOLD = 10
 """Periods over which the last motion goes on; for longer it is not known to."""
@@ -24,8 +27,13 @@ OTHER_LASER = "other laser"
 
 def as_used(network: Stepper) -> Stepper:
     """What steps through encoded scans: a network itself, or what predicts and warps for it."""
+    return _predicting(network) or network
+
+
+def _predicting(network: Stepper) -> "WarpingStepper | None":
+    """What predicts and warps for a network that measures residual motions; None for other networks."""
     if network.description.warping is None:
-        return network
+        return None
     from rcnn_odom.models.warping import WarpingStepper  # compiled code, which other networks do not need
 
     return network if isinstance(network, WarpingStepper) else WarpingStepper(cast(Network, network))
@@ -39,7 +47,8 @@ class PairTracker:
     - *no returns*: the last motion goes on, as over a gap.
     - *gap*, where scans were dropped or had no returns, so that more than one period has passed: the last
       motion goes on over it, for ``LONGEST_HOLD`` periods at most. Networks do not know such long steps;
-      comparing the scans at both ends all the same is several times worse (docs/deployment.md).
+      comparing the scans at both ends all the same is several times worse (docs/deployment.md). A network
+      that measures residual motions compares them from where the motion leads, across as many periods.
     - *other laser*, beams that do not lie where the sensor has them, or readings that cannot be metres (see
       :mod:`rcnn_odom.recordings.beams`): not used, the last motion goes on.
     - *beam count*, other than before: the scan is encoded into the same bins as any other.
@@ -57,7 +66,8 @@ class PairTracker:
     """
 
     def __init__(self, stepper: Stepper) -> None:
-        self._stepper = as_used(stepper)
+        self._predicting = _predicting(stepper)
+        self._stepper = self._predicting or stepper
         self.description, self.period = stepper.description, stepper.description.period
         self._forget()
 
@@ -100,19 +110,31 @@ class PairTracker:
         depth = self._encode(scan, notes)
         if not depth.any():
             self._missed += periods
-            return self._hold(periods, notes)
+            return self._go_on(periods, notes)
         pair, self._earlier = np.stack([self._earlier, depth]), depth
         gap, self._missed = periods + self._missed, 0
+        is_across = self._predicting is not None and gap <= LONGEST_HOLD
         if gap > 1:
-            return self._hold(
-                periods, [*notes, f"gap: {gap} periods after the last scan, the last motion goes on"]
-            )
-        step = self._stepper(pair)
+            how = "compared across it" if is_across else "the last motion goes on"
+            notes.append(f"gap: {gap} periods after the last scan, {how}")
+            if not is_across:
+                return self._hold(periods, notes)
+        step = self._predicting(pair, periods) if self._predicting else self._stepper(pair)
         if not np.isfinite(step.array()).all():
             self._stepper.reset()  # its state is nan as well
             return self._hold(periods, [*notes, "no estimate: the last motion goes on"])
-        self._motion, self._held, self._open = step.array(), 0, step.taken_back
+        if periods == 1:
+            self._motion = step.array()
+        self._held, self._open = 0, step.taken_back
         return Registered(step, tuple(notes))
+
+    def _go_on(self, periods: int, notes: list[str]) -> Registered:
+        """The step to a scan without returns."""
+        if self._predicting is None or self._held + periods > LONGEST_HOLD:
+            return self._hold(periods, notes)
+        step = self._predicting.predict(periods)
+        self._held, self._open = self._held + periods, step.taken_back
+        return Registered(step, tuple(notes), is_estimated=False)
 
     def _encode(self, scan: Scan, notes: list[str]) -> npt.NDArray[np.float32]:
         """A depth vector (bins,), empty where the scan does not fit; adds what is unusual to ``notes``."""

@@ -48,22 +48,35 @@ class WarpingStepper:
         self._last: npt.NDArray[np.float32] | None = None
         self._pose: FloatArray = np.zeros(3)
 
-    def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
-        """The step between two encoded scans (2, bins), the earlier first."""
+    def __call__(self, pair: npt.NDArray[np.float32], periods: int = 1) -> Step:
+        """The step between two encoded scans (2, bins), the earlier first.
+
+        Args:
+            pair: the two scans.
+            periods: usual times between scans from the earlier scan, or from where :meth:`predict` has led
+                since, to the later one.
+        """
         if self._last is None or not np.array_equal(pair[0], self._last):
             self._take_key(pair[0])  # the first pair, or scans between were not for the network
-        expected = advance(self._pose, self._filter.motion)
-        measured = self._measure(pair[1], expected)
+        expected = advance(self._pose, self._filter.displacement(periods))
+        measured = self._measure(pair[1], expected, periods)
         if measured is None:
             self.reset()
             return Step(math.nan, math.nan, math.nan)
-        believed, covariance, taken_back = self._filter.correct(*measured)
+        believed, covariance, taken_back = self._filter.correct(*measured, periods)
         pose = advance(expected, believed)
         x, y, heading = relative_step(self._pose, pose).tolist()
         self._last, self._pose = pair[1].copy(), pose
         if self.warping.needs_key(pose):
             self._take_key(pair[1])
             taken_back = np.zeros((3, 3))
+        return Step(x, y, heading, covariance, taken_back)
+
+    def predict(self, periods: int) -> Step:
+        """The step over so many periods to a scan that shows nothing: the motion goes on."""
+        x, y, heading = self._filter.displacement(periods).tolist()
+        covariance, taken_back = self._filter.predict(periods)
+        self._pose = advance(self._pose, np.array([x, y, heading]))
         return Step(x, y, heading, covariance, taken_back)
 
     def _take_key(self, scan: npt.NDArray[np.float32]) -> None:
@@ -73,7 +86,7 @@ class WarpingStepper:
         self._filter.take_key()
 
     def _measure(
-        self, scan: npt.NDArray[np.float32], expected: FloatArray
+        self, scan: npt.NDArray[np.float32], expected: FloatArray, periods: int
     ) -> tuple[FloatArray, FloatArray] | None:
         """Where a scan was taken, seen from where it is expected (3,), and the covariance (3, 3) of that.
 
@@ -94,7 +107,7 @@ class WarpingStepper:
             whole = relative_step(expected, advance(pose, residual.array()))
             covariance = turn_covariance(residual.covariance, float(whole[2]) - residual.heading)
             last, is_far_off = believed, self._size(residual.array()) > LOST
-            believed = whole if is_far_off else self._filter.weigh(whole, covariance)
+            believed = whole if is_far_off else self._filter.weigh(whole, covariance, periods)
             if self._size(believed - last) < self.warping.settled:
                 break
         if number and is_far_off:
