@@ -2,7 +2,7 @@
 PYTHON ?= python3
 BIN := .venv/bin
 
-.PHONY: train test test-all coverage fuzz lint bench bench-train install robot-wheel
+.PHONY: train test test-all coverage fuzz lint bench bench-train figures install robot-wheel
 install: .venv/installed
 
 .venv/installed: pyproject.toml constraints.txt
@@ -34,6 +34,10 @@ bench: install
 
 bench-train: install
 	$(BIN)/python -m rcnn_odom.training.bench_train
+
+# All of docs/, or PAGES="docs/matcher.md docs/training.md".
+figures: install
+	$(BIN)/python docs/update_figures.py $(PAGES)
 
 # From the files as they are, not as an earlier build has left them.
 robot-wheel: install

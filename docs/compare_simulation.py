@@ -30,7 +30,7 @@ from rcnn_odom.recordings.trajectory import read_kitti
 from rcnn_odom.simulation.street.city import RESIDENTIAL, random_plan, random_warp
 from rcnn_odom.simulation.street.drive import random_drive
 from rcnn_odom.simulation.street.speed import FRAME_TIME
-from rcnn_odom.simulation.terrain import flat_ground, stand
+from rcnn_odom.simulation.terrain import flat_ground, place_on_ground
 
 Figures = dict[str, float]
 """By a name that says the unit; nan where too little is known."""
@@ -84,7 +84,7 @@ def simulated_motion(seeds: int) -> list[Driven]:
             plan = random_plan(rng)
             drive = random_drive(plan, random_warp(plan, rng), frames, rng)
             level = flat_ground(drive.path.min(0), drive.path.max(0))
-            drives.append(Driven(stand(drive.planar, drive.tilt, 1.7, level), FORWARD_CAMERA))
+            drives.append(Driven(place_on_ground(drive.planar, drive.tilt, 1.7, level), FORWARD_CAMERA))
     return drives
 
 
