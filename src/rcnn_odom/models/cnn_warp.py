@@ -65,7 +65,7 @@ class ResidualOptions:
     Attributes:
         x, y: metres, standard deviations along and across the motion.
         heading_deg: degrees.
-        smallest, largest: powers of ten between which each guess's deviations are scaled.
+        smallest, largest: powers of ten between which each of the three deviations is scaled by itself.
     """
 
     x: float = option(above=0)
@@ -359,9 +359,10 @@ class ResidualNetwork(TrainedModel):
             return step
         options = ResidualOptions(**self.options["residual"])
         deviations = np.array([options.x, options.y, math.radians(options.heading_deg)])
-        drawn: FloatArray = (
-            deviations * rng.standard_normal(3) * 10 ** rng.uniform(options.smallest, options.largest)
-        )
+        # A scale for each of the three: with one for all, the network would infer the size of one part of the
+        # residual from the others, and along a corridor take a guess for right since its heading is.
+        scale = 10 ** rng.uniform(options.smallest, options.largest, 3)
+        drawn: FloatArray = deviations * rng.standard_normal(3) * scale
         return drawn
 
 

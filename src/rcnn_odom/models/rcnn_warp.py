@@ -31,7 +31,7 @@ from rcnn_odom.models.trained import Batch, State, TrainedModel
 from rcnn_odom.options import option
 
 POWERS = (-3.0, -1.0)
-"""Powers of ten between which the errors of a window's earlier estimates are scaled in training."""
+"""Powers of ten between which the errors of a window's earlier estimates are scaled, x, y and heading each."""
 
 
 @dataclass(kw_only=True)
@@ -132,7 +132,7 @@ class RCNNWarp(ResidualNetwork):
         earlier, guesses, residuals = scans[:, :-1].copy(), *np.empty((2, count, steps, 3))
         spread = self.units.double().cpu().numpy()
         for n in range(count):
-            off = spread * 10 ** rng.uniform(*POWERS) * rng.standard_normal((steps + 1, 3))
+            off = spread * 10 ** rng.uniform(*POWERS, 3) * rng.standard_normal((steps + 1, 3))
             key, estimate = 0, poses[n, 0]
             motion = relative_step(poses[n, 0], poses[n, 1]) + self.draw_residual(np.full(3, np.inf), rng)
             for t in range(1, steps + 1):
