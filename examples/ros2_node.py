@@ -3,14 +3,15 @@
     pip install PATH_OF_THIS_REPOSITORY    # into the Python of your ROS 2
     python3 ros2_node.py --ros-args -p base_frame:=base_link -r scan:=/my_laser
 
-Parameters: model (matcher, which is scan matching and needs no training; or all_round or half_circle, which
-ship along, an exported .onnx or a .ckpt), odom_frame (odom), base_frame (empty), publish_tf (true). Publishes
-/odom and the transform from odom_frame to base_frame, in the header's stamp. With base_frame, poses are those
-of the robot, by the static transform from there to the laser; without it those of the laser, whose frame must
-then have no other parent, or publish_tf be false. The pose has the covariance that has accumulated since the
-first scan, the twist that of the last step over its time; what is unknown, and z, roll and pitch, have a
-variance of 1e6. What an estimate suffers from (gaps, few returns) is logged; a scan that is passed over is
-not published. The file can be imported without ROS.
+Parameters: model (matcher: scan matching, which needs no training; or the networks all_round for lasers that
+turn all round and half_circle for 180 to 270 degrees, an exported .onnx or a .ckpt), odom_frame (odom),
+base_frame (empty), publish_tf (true).
+The node publishes /odom and the transform from odom_frame to base_frame, with the stamp of the scan. With
+base_frame, poses are those of the robot, computed with the static transform from base_frame to the laser.
+Without it, they are those of the laser, and either its frame has no other parent or publish_tf must be false.
+The covariance of the pose is accumulated since the first scan; twist and its covariance are those of the last
+step, divided by its duration. Unknown values, and z, roll and pitch, have a variance of 1e6. Problems (gaps,
+few returns) are logged; a scan that is passed over is not published. The file can be imported without ROS.
 """
 
 import math
@@ -26,38 +27,38 @@ from rcnn_odom.recordings.rosbag import convert
 
 
 def fill(message, pose: Pose, seconds: float) -> None:
-    """Writes a pose into an Odometry message; its last step took so many seconds."""
+    """Writes a pose into an Odometry message; ``seconds`` is the duration of its last step."""
     message.pose.pose.position.x, message.pose.pose.position.y = pose.x, pose.y
     message.pose.pose.orientation.z = math.sin(pose.heading / 2)
     message.pose.pose.orientation.w = math.cos(pose.heading / 2)
     fill_covariance(message.pose.covariance, pose.covariance)
-    velocity, covariance = velocity_of(pose.step, seconds)  # in the child's own frame
+    velocity, covariance = velocity_of(pose.step, seconds)  # in the child frame
     twist = message.twist.twist
     twist.linear.x, twist.linear.y, twist.angular.z = velocity
     fill_covariance(message.twist.covariance, covariance)
 
 
 def fill_covariance(values, covariance) -> None:
-    """Writes a covariance (3, 3) of x, y and yaw among the 36 of a message."""
+    """Writes a covariance (3, 3) of x, y and yaw into the 36 values of a message."""
     values[:] = ros_covariance(covariance)
 
 
-def planar(transform) -> tuple[tuple[float, float, float], bool]:
-    """x, y and yaw of a Transform message, and whether the laser hangs upside down.
+def read_transform(transform) -> tuple[tuple[float, float, float], bool]:
+    """x, y and yaw of a Transform message, and whether the laser is mounted upside down.
 
     Raises:
-        InputError: it does not lie level.
+        InputError: the laser is tilted.
     """
-    at, q = transform.translation, transform.rotation
+    position, q = transform.translation, transform.rotation
     up = 1 - 2 * (q.x**2 + q.y**2)
     if abs(up) < math.cos(math.radians(5)):
-        raise InputError("the laser does not lie level on base_frame; correct its transform")
+        raise InputError("the laser is tilted with respect to base_frame; correct its transform")
     yaw = math.atan2(2 * (q.w * q.z + q.x * q.y), 1 - 2 * (q.y**2 + q.z**2))
-    return (at.x, at.y, yaw), up < 0
+    return (position.x, position.y, yaw), up < 0
 
 
 def load(model: str) -> Odometer:
-    """An odometer of the laser, of scan matching or of a network."""
+    """An odometer with scan matching or a network, for poses of the laser."""
     if model == "matcher":
         return Odometer()
     if model.endswith(".ckpt"):
@@ -69,7 +70,7 @@ def load(model: str) -> Odometer:
 
 
 class OdometryNode:
-    """Takes scans, publishes odometry."""
+    """Subscribes to scans and publishes odometry."""
 
     def __init__(self, node) -> None:
         from nav_msgs.msg import Odometry
@@ -89,14 +90,14 @@ class OdometryNode:
         node.create_subscription(LaserScan, "scan", self.on_scan, qos_profile_sensor_data)
 
     def on_scan(self, message) -> None:
-        """One scan in, one message and one transform out."""
+        """Computes the pose of one scan and publishes it."""
         warn = self.node.get_logger().warning
         try:
             scan = convert(message, self.node.get_clock().now().nanoseconds)
         except ValueError as error:
-            return warn(f"no scan: {error}")
+            return warn(f"scan ignored: {error}")
         if self.base_frame and self.odometer.laser_pose is None and not self.find_laser(scan.frame_id):
-            return warn(f"no scan yet: no transform from {self.base_frame} to {scan.frame_id}")
+            return warn(f"scan ignored: no transform from {self.base_frame} to {scan.frame_id} yet")
         if self.is_upside_down:
             scan = replace(scan, bearings=-scan.bearings)
         pose = self.odometer.step(scan)
@@ -109,18 +110,18 @@ class OdometryNode:
             self.last_stamp = scan.stamp
 
     def find_laser(self, frame: str) -> bool:
-        """Looks once where the laser sits on the robot; whether that is known by now."""
+        """Looks up the pose of the laser on the robot; returns whether it is known."""
         from rclpy.time import Time
 
         if not self.buffer.can_transform(self.base_frame, frame, Time()):
             return False
         found = self.buffer.lookup_transform(self.base_frame, frame, Time())
-        laser_pose, self.is_upside_down = planar(found.transform)
+        laser_pose, self.is_upside_down = read_transform(found.transform)
         self.odometer = Odometer(self.odometer.tracker, laser_pose)
         return True
 
     def publish(self, header, pose: Pose, seconds: float) -> None:
-        """A pose as a message, and as a transform."""
+        """Publishes a pose as a message and as a transform."""
         from geometry_msgs.msg import TransformStamped
         from nav_msgs.msg import Odometry
 
@@ -133,11 +134,11 @@ class OdometryNode:
         fill(odometry, pose, seconds)
         self.publisher.publish(odometry)
         if self.broadcaster:
-            moved = TransformStamped()
-            moved.header, moved.child_frame_id = odometry.header, child
-            moved.transform.translation.x, moved.transform.translation.y = pose.x, pose.y
-            moved.transform.rotation = odometry.pose.pose.orientation
-            self.broadcaster.sendTransform(moved)
+            transform = TransformStamped()
+            transform.header, transform.child_frame_id = odometry.header, child
+            transform.transform.translation.x, transform.transform.translation.y = pose.x, pose.y
+            transform.transform.rotation = odometry.pose.pose.orientation
+            self.broadcaster.sendTransform(transform)
 
 
 def main() -> None:

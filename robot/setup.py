@@ -1,4 +1,4 @@
-"""Leaves single modules out of the robot's distribution, which pyproject.toml alone cannot."""
+"""Leaves single modules out of the robot's distribution, which pyproject.toml alone cannot do."""
 
 import tomllib
 from pathlib import Path
@@ -10,13 +10,13 @@ SETTINGS = tomllib.loads(Path(__file__).with_name("pyproject.toml").read_text(en
 LEFT_OUT = SETTINGS["tool"]["rcnn-odom-robot"]["left-out"]
 
 
-class BuildWithout(build_py):
-    """Takes all modules but those that are left out."""
+class BuildWithoutModules(build_py):
+    """Builds the distribution without the modules in ``LEFT_OUT``."""
 
     def find_package_modules(self, package: str, package_dir: str) -> list[tuple[str, str, str]]:
-        """Package, name and file of each module."""
-        found = super().find_package_modules(package, package_dir)
-        return [each for each in found if f"{each[0]}.{each[1]}" not in LEFT_OUT]
+        """Finds the package, name and file of each module that is built."""
+        modules = super().find_package_modules(package, package_dir)
+        return [each for each in modules if f"{each[0]}.{each[1]}" not in LEFT_OUT]
 
 
-setup(cmdclass={"build_py": BuildWithout})
+setup(cmdclass={"build_py": BuildWithoutModules})

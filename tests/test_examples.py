@@ -12,11 +12,24 @@ from rcnn_odom import matching
 
 MODULES = [
     "rcnn_odom.geometry",
+    "rcnn_odom.compiled",
+    "rcnn_odom.options",
+    "rcnn_odom.registry",
     "rcnn_odom.evaluation.drift",
+    "rcnn_odom.evaluation.relations",
+    "rcnn_odom.evaluation.sweep_report.statistics",
     *(f"{matching.__name__}.{module.name}" for module in pkgutil.iter_modules(matching.__path__)),
     "rcnn_odom.models.matcher",
     "rcnn_odom.deployment.odometer",
 ]
+SOME_EXAMPLES = [
+    *(f"rcnn_odom.deployment.{name}" for name in ("output", "ros_messages", "run", "sampling")),
+    "rcnn_odom.evaluation.metrics",
+    "rcnn_odom.evaluation.run_folder",
+    "rcnn_odom.evaluation.scores",
+    *(f"rcnn_odom.evaluation.sweep_report.{name}" for name in ("document", "folders", "options")),
+]
+"""Modules whose examples are run, although not every public part has one."""
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 
 
@@ -56,7 +69,7 @@ def without_example(tree):
             yield f"{owner.name}.{node.name}" if owner else node.name
 
 
-@pytest.mark.parametrize("name", MODULES)
+@pytest.mark.parametrize("name", [*MODULES, *SOME_EXAMPLES])
 def test_examples_print_what_they_say(name):
     module = import_module(name)
     runner = doctest.DocTestRunner(optionflags=FLAGS)

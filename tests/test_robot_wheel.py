@@ -168,14 +168,16 @@ def test_a_bag_becomes_the_trajectory_that_it_does_here(call, bag, tmp_path, wor
 @pytest.mark.parametrize("arguments", [(), ("--help",), ("-m", "model=rcnn_reg", "+sweeps=table2")])
 def test_what_needs_more_says_in_a_line_what_to_install(call, name, arguments):
     done = call("rcnn-odom", name, *arguments, status=1)
-    told = f"rcnn-odom {name} needs more than rcnn-odom-robot has: pip install rcnn-odom"
+    told = f"rcnn-odom {name} needs the full distribution, not only rcnn-odom-robot: pip install rcnn-odom"
     assert (done.stdout, done.stderr) == ("", f"rcnn-odom: error: {told}\n")
 
 
 @pytest.mark.slow
 def test_other_commands_run_or_say_what_to_install(call, bag, tmp_path):
     checkpoint = call("rcnn-odom", "run", bag, "--model", "best.ckpt", "--out", tmp_path / "out", status=1)
-    told = "best.ckpt: a checkpoint needs more than rcnn-odom-robot has: pip install rcnn-odom"
+    told = (
+        "best.ckpt: a checkpoint needs the full distribution, not only rcnn-odom-robot: pip install rcnn-odom"
+    )
     assert checkpoint.stderr == f"rcnn-odom: error: {told}\n"
     made = call("rcnn-odom", "simulate", "--out", tmp_path / "drives", "--frames", "4")
     assert made.stdout == f"wrote 00 to {tmp_path}/drives\n"

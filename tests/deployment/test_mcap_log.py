@@ -264,7 +264,32 @@ def test_stamps_of_the_period_where_there_are_none(tmp_path):
         messages = values(messages_in(path)["/odometry"])
         stamps = [seconds(each.header) for each in messages]
         np.testing.assert_allclose(stamps, expected * np.arange(1, 6), atol=1e-9)
-        assert messages[-1].twist.twist.angular.z == pytest.approx(STEP.heading / expected)
+        for message in messages:  # nobody knows the time that a step took
+            assert_unknown(message.twist)
+
+
+def assert_unknown(twist):
+    """Zero and finite, with the large variances that mark what is unknown."""
+    assert (twist.twist.linear.x, twist.twist.linear.y, twist.twist.angular.z) == (0.0, 0.0, 0.0)
+    np.testing.assert_array_equal(twist.covariance, 1e6 * np.eye(6).ravel())
+
+
+def test_a_twist_needs_the_stamps_of_both_its_scans(tmp_path):
+    """Others are a period apart only by assumption; over a clock that was set no time is known."""
+    path = tmp_path / "out.mcap"
+    given = [None, 0.0, 0.1, None, 0.3, 0.5, 0.0, 0.6, 100.0, 100.2]
+    stamps = [None if each is None else START + each for each in given]
+    stamps[6] = 0.0  # of a driver that has no time
+    scans = [replace(scan, stamp=stamp) for scan, stamp in zip(room_scans(10), stamps, strict=True)]
+    run(Odometer(Ahead()), stream_of(scans), "ahead", outputs=[McapLog(path)])
+    twists = [each.twist for each in values(messages_in(path)["/odometry"])]
+    known = {2: 0.1, 5: 0.2, 9: 0.2}
+    for number, twist in enumerate(twists):
+        if number in known:
+            assert twist.twist.angular.z == pytest.approx(STEP.heading / known[number], rel=1e-5)
+            assert twist.covariance[0] < 1
+        else:
+            assert_unknown(twist)
 
 
 def test_a_clock_that_goes_back_or_is_set_leaves_the_order_of_the_file(tmp_path):
@@ -290,7 +315,7 @@ def test_remarks_are_a_log(tmp_path):
     logs = values(messages_in(path)["/rosout"])
     assert [(each.level, each.name, each.msg) for each in logs] == [
         (30, "rcnn_odom", "poor match: it does not fit"),
-        (20, "rcnn_odom", "poor match: over, 2 scans from the 4. to the 5."),
+        (20, "rcnn_odom", "poor match: over, 2 scans marked from scan 4 to scan 5"),
     ]
     assert seconds(SimpleHeader(logs[0].stamp)) == pytest.approx(START + 0.3, abs=1e-6)
 

@@ -6,6 +6,9 @@ import subprocess
 import sys
 import tomllib
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -14,8 +17,10 @@ from conftest import ROOT
 from matching.rooms import BOX, cast, circle
 from outputs import Ahead, breaks_off, room_scans, stream_of
 from rcnn_odom.cli import main
+from rcnn_odom.deployment import rerun_log
 from rcnn_odom.deployment.odometer import Odometer
-from rcnn_odom.deployment.output import LocalMaps, OutputFile, Remarks, Stamps, thinned
+from rcnn_odom.deployment.output import LocalMaps, OutputFile, Remarks, Stamps, thin_points
+from rcnn_odom.deployment.rerun_log import RerunFile
 from rcnn_odom.deployment.run import run
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.scan import Scan
@@ -84,9 +89,33 @@ def test_without_rerun_it_says_how_to_get_it(arguments, message, monkeypatch, tm
     assert message in refusal
     project = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
     [requirement] = project["optional-dependencies"]["view"]
-    assert refusal.endswith(f": pip install '{requirement}'\n")
+    assert refusal.endswith(f": pip install 'rcnn-odom[view]', or pip install '{requirement}'\n")
     assert refusal.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("installed", "named"),
+    [
+        (["rcnn-odom-robot"], "rcnn-odom-robot"),
+        (["rcnn-odom", "rcnn-odom-robot"], "rcnn-odom"),
+        ([], "rcnn-odom"),
+    ],
+)
+def test_the_extra_is_that_of_the_installed_distribution(installed, named, monkeypatch):
+    def distribution(name):
+        if name not in installed:
+            raise PackageNotFoundError(name)
+        return SimpleNamespace(metadata={"Name": name})
+
+    monkeypatch.setattr(rerun_log, "distribution", distribution)
+    monkeypatch.setitem(sys.modules, "rerun", None)
+    with pytest.raises(InputError, match=rf": pip install '{named}\[view\]', or pip install 'rerun-sdk"):
+        RerunFile(Path("out.rrd"))
+    folder = {"rcnn-odom": ".", "rcnn-odom-robot": "robot"}[named]
+    project = tomllib.loads((ROOT / folder / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert project["name"] == named
+    assert project["optional-dependencies"]["view"] == [rerun_log.REQUIREMENT]
 
 
 def test_something_must_take_the_poses(capsys):
@@ -99,7 +128,9 @@ def test_stamps_are_those_of_the_recording_or_a_period_apart():
     stamps = Stamps(float("nan"))
     given = [None, 5.0, None, float("nan"), 0.0, -3.0, 1e18, 4.0]
     expected = [0.1, 5.0, 5.1, 5.2, 5.3, 5.4, 5.5, 4.0]
-    np.testing.assert_allclose([stamps.next(stamp) for stamp in given], expected)
+    got = [(stamps.next(stamp), stamps.is_recorded) for stamp in given]
+    np.testing.assert_allclose([seconds for seconds, _ in got], expected)
+    assert [number for number, (_, is_recorded) in enumerate(got) if is_recorded] == [1, 7]
     assert Stamps(0.05).period == 0.05
     for given, expected in (([0.0, 0.104, 0.207], [0.0, 0.104, 0.207]), ([0.0, 0.0, 0.0], [0.0, 0.1, 0.2])):
         stamps = Stamps(float("nan"))
@@ -114,8 +145,8 @@ def test_a_stretch_is_told_at_its_beginning_and_at_its_end():
     assert told == [
         (2, "held: the motion at 5 degrees", True),
         (6, "gap: 3 periods", True),
-        (17, "held: over, 4 scans from the 2. to the 6.", False),
-        (17, "gap: over, 1 scans from the 6. to the 6.", False),
+        (17, "held: over, 4 scans marked from scan 2 to scan 6", False),
+        (17, "gap: over, 1 scan marked from scan 6 to scan 6", False),
     ]
 
 
@@ -210,6 +241,6 @@ assert not {{"rosbags", "rerun"}} & sys.modules.keys()"""
 @pytest.mark.parametrize(("count", "left"), [(0, 0), (1, 1), (500, 500), (501, 251), (999, 500), (1001, 334)])
 def test_thinned_points_are_never_more_than_asked_for(count, left):
     points = np.arange(2.0 * count, dtype=np.float32).reshape(-1, 2)
-    kept = thinned(points, 500)
+    kept = thin_points(points, 500)
     assert len(kept) == left
     assert np.array_equal(kept, points[:: max(1, round(count / max(left, 1)))])

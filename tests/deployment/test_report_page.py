@@ -19,7 +19,7 @@ from rcnn_odom.cli import main
 from rcnn_odom.deployment.causes import CAUSES, explain
 from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.report_page import write_page
-from rcnn_odom.deployment.report_pictures import Seen, as_png, pictures_of
+from rcnn_odom.deployment.report_pictures import MapScan, as_png, make_pictures
 from rcnn_odom.deployment.run import run
 from rcnn_odom.deployment.three_lines import three_lines
 from rcnn_odom.deployment.timeline import Timeline
@@ -161,8 +161,8 @@ def test_marked_stretches_are_listed_with_what_to_do(toy):
     page, summary = toy
     rows = [" ".join(row.split()) for row in page.rows]
     first = rows.index("3.0 s (scan 31) 4.1 s (scan 42) 12")
-    assert rows[first - 1].startswith("no returns , 12 scans: nothing came back")
-    assert "What to do: see whether something covered the laser" in rows[first - 1]
+    assert rows[first - 1].startswith("no returns , 12 scans: the scan had no returns")
+    assert "What to do: check whether something covered the laser" in rows[first - 1]
     assert "7.9 s (scan 80) 7.9 s (scan 80) 1" in rows
     assert "odd , 1 scan: <b>it</b>. What to do: see the documentation of the model." in rows
     assert summary["marked"]["no returns"] == [
@@ -194,21 +194,21 @@ def test_names_that_are_markup_or_no_text(tmp_path):
 def test_without_a_clock_the_axis_counts_scans(tmp_path):
     page, summary = page_of(tmp_path / "out", Tracker({5: ("gap: 3",)}), stream_of(9, stamps=False))
     assert "Speed" not in page.headings
-    assert "numbers along the path are number of the scan" in page.source
+    assert "Numbers along the path: number of the scan" in page.source
     assert "scan 5 scan 5 1" in [" ".join(row.split()) for row in page.rows]
     assert (summary["recording_s"], summary["speed"]) == (None, None)
 
 
 def test_a_model_that_knows_no_covariance(tmp_path):
     page, _ = page_of(tmp_path / "out", Tracker(covariance=UNKNOWN), stream_of(4))
-    assert "The model does not tell that of x." in page.source
+    assert "The model does not estimate the deviation of x." in page.source
     assert "x unknown, y unknown, heading unknown" in page.images[3]["alt"]
 
 
 def test_a_run_of_one_scan(tmp_path):
     page, summary = page_of(tmp_path / "out", Tracker(), stream_of(1))
     assert (summary["scans"], summary["speed"]) == (1, None)
-    assert "None: no scan suffered from anything." in page.source
+    assert "None: no scan was marked." in page.source
 
 
 def test_without_matplotlib_words_and_tables_remain(monkeypatch, tmp_path, caplog):
@@ -234,7 +234,7 @@ def test_a_long_drive_stays_small(tmp_path):
         timeline.add(pose)
         if number % 8 == 0:
             points = rng.uniform(-60, 60, (181, 2)).astype(np.float32)
-            seen.append(Seen((pose.x, pose.y, pose.heading), points, number, 0.1 * number))
+            seen.append(MapScan((pose.x, pose.y, pose.heading), points, number, 0.1 * number))
     end = {"x": pose.x, "y": pose.y, "heading": pose.heading}
     summary = {"input": "long", "model": "toy", "laser_pose": None, "scans": 13_000, "path_m": 1300.0}
     summary |= {"latency": {"median_ms": 1.0}, "recording_s": 1300.0, "end": end, "skipped": {}}
@@ -264,7 +264,7 @@ def test_stretches_are_shaded_where_they_are(toy, monkeypatch):
     odometer = Odometer(Tracker({21: ("held: x",), 22: ("held: x",), 60: ("gap: x",)}))
     for number in range(100):
         timeline.add(odometer.step(Scan(np.full(181, 5.0), ANGLES, stamp=0.1 * number)))
-    for picture in [each for each in pictures_of(timeline, [], "") if each.heading != "Map and path"]:
+    for picture in [each for each in make_pictures(timeline, [], "") if each.heading != "Map and path"]:
         figure = picture.draw()
         for axes in figure.axes:
             spans = {

@@ -42,7 +42,9 @@ def read(path):
             plain = {name.partition(":")[2]: each.as_py() for name, each in values.items() if ":" in name}
             plain = {name: each for name, each in plain.items() if each is not None}
             if "scan" in values:
-                plain |= {"scan": values["scan"].as_py(), "seconds": values["stamp"].value * 1e-9}
+                plain["scan"] = values["scan"].as_py()
+            if "stamp" in values:
+                plain |= {"seconds": values["stamp"].value * 1e-9, "time": str(values["stamp"].type)}
             found.setdefault(chunk.entity_path, []).append(plain)
     return {place: sorted(rows, key=lambda row: row.get("scan", -1)) for place, rows in found.items()}
 
@@ -91,7 +93,7 @@ def test_a_recording_holds_what_the_run_itself_wrote(tmp_path):
     ]
     assert [(row["scan"], row["text"], row["level"]) for row in found["/marks"]] == [
         (4, ["poor match: it does not fit"], ["WARN"]),
-        (16, ["poor match: over, 2 scans from the 4. to the 5."], ["INFO"]),
+        (16, ["poor match: over, 2 scans marked from scan 4 to scan 5"], ["INFO"]),
     ]
 
 
@@ -124,6 +126,27 @@ def test_seconds_from_some_start_and_scans_that_are_passed_over(tmp_path):
     assert [row["scan"] for row in poses] == [1, 2, 3, 5]
     np.testing.assert_allclose([row["seconds"] for row in poses], np.delete(times, 3))
     assert found["/marks"][0]["text"][0].startswith("late scan")
+
+
+@pytest.mark.parametrize(("start", "kind"), [(START, "timestamp[ns]"), (5.0, "duration[ns]")])
+def test_the_first_scan_with_a_stamp_decides_whether_stamps_are_dates(tmp_path, start, kind):
+    """Scans before it are on the time line of their numbers alone."""
+    path, scans = tmp_path / "out.rrd", room_scans(6)
+    stamps = [None, None, *(start + 0.1 * np.arange(4))]
+    scans = [replace(scan, stamp=stamp) for scan, stamp in zip(scans, stamps, strict=True)]
+    run(Odometer(Ahead()), stream_of(scans), "ahead", outputs=[RerunFile(path)])
+    poses = timed(read(path)["/odom/laser"])
+    assert [row["scan"] for row in poses] == [1, 2, 3, 4, 5, 6]
+    assert [row.get("time") for row in poses] == [None, None, *[kind] * 4]
+    np.testing.assert_allclose([row["seconds"] for row in poses[2:]], stamps[2:], atol=1e-6)
+
+
+def test_without_stamps_there_is_only_the_time_line_of_the_scans(tmp_path):
+    path = tmp_path / "out.rrd"
+    scans = [replace(scan, stamp=None) for scan in room_scans(3)]
+    run(Odometer(Ahead()), stream_of(scans), "ahead", outputs=[RerunFile(path)])
+    poses = timed(read(path)["/odom/laser"])
+    assert [(row["scan"], row.get("time")) for row in poses] == [(1, None), (2, None), (3, None)]
 
 
 def test_the_viewer_shows_the_whole_path_and_the_marks(tmp_path):

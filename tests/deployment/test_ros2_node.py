@@ -183,7 +183,7 @@ def test_the_node_with_a_network(example, tmp_path, monkeypatch):
     broken = scan_message(scans[0], 99.5)
     broken.angle_min = float("nan")
     ros.handlers[0](broken)
-    assert warnings.pop() == "no scan: its angle_min is nan"
+    assert warnings.pop() == "scan ignored: its angle_min is nan"
     published.clear()
     for number, scan in enumerate([*scans, np.zeros(181), np.zeros(181)]):
         ros.scan(scan, 100.0 + 0.1 * number)
@@ -243,7 +243,7 @@ def test_the_node_tells_of_the_robot_once_it_knows_where_its_laser_sits(example,
     ros = Ros(monkeypatch, base_frame="base_link")
     example.main()
     ros.scan(np.full(70, 5.0), 100.0)
-    assert ros.warnings == ["no scan yet: no transform from base_link to laser"]
+    assert ros.warnings == ["scan ignored: no transform from base_link to laser yet"]
     assert ros.published == []
     ros.transforms["base_link", "laser"] = transform(0.4, 0.1, (0, 0, np.sqrt(0.5), np.sqrt(0.5)))
     ros.scan(np.full(70, 5.0), 100.1)
@@ -266,7 +266,9 @@ def test_a_laser_that_hangs_upside_down_or_is_tilted(example, monkeypatch):
         ros.transforms["base_link", "laser"] = transform(0, 0, (np.sin(half), 0, 0, np.cos(half)))
         example.main()
         if is_refused:
-            with pytest.raises(InputError, match="does not lie level on base_frame; correct its transform"):
+            with pytest.raises(
+                InputError, match="is tilted with respect to base_frame; correct its transform"
+            ):
                 ros.scan(np.full(70, 5.0), 100.0)
         else:
             ros.scan(np.full(70, 5.0), 100.0)

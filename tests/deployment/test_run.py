@@ -1,6 +1,7 @@
 """``rcnn-odom run``: recordings and live scans through an exported network."""
 
 import json
+import logging
 import os
 import re
 import signal
@@ -33,6 +34,7 @@ from data.make_bag import (
 from data.make_carmen import make_carmen
 from data.make_kitti import TR, make_kitti
 from odometry import SENSOR, build, random_scans
+from outputs import breaks_off
 from rcnn_odom.cli import main
 from rcnn_odom.deployment.odometer import Odometer
 from rcnn_odom.deployment.run import run
@@ -71,7 +73,7 @@ def velodyne(tmp_path_factory):
 @pytest.fixture(autouse=True)
 def no_time_plots(monkeypatch):
     """Which take seconds for each run; test_report_page.py draws them."""
-    for name in ("_motion", "_deviations"):
+    for name in ("_motion_pictures", "_deviation_pictures"):
         monkeypatch.setattr(f"rcnn_odom.deployment.report_pictures.{name}", lambda timeline: ())
 
 
@@ -152,9 +154,8 @@ def test_two_topics_and_the_wrong_laser(model, velodyne, tmp_path, capsys):
     assert main(["run", "--model", model, bag, "--out", str(out)]) == 1
     assert "choose one with --topic: /a, /b" in capsys.readouterr().err
     assert main(["run", "--model", velodyne, bag, "--out", str(out), "--topic", "/a"]) == 1
-    assert (
-        "the sensor's all round, one every 0.5 (frame laser); take --model matcher" in capsys.readouterr().err
-    )
+    message = capsys.readouterr().err
+    assert "but the sensor's lie all round, one every 0.5 (frame laser); take --model matcher" in message
     assert not out.exists()
     assert main(["run", "--model", model, bag, "--out", str(out), "--topic", "/a"]) == 0
 
@@ -253,6 +254,35 @@ def test_a_killed_run_leaves_whole_lines(model, tmp_path):
     assert abs(len(read_kitti(tmp_path / "out" / "trajectory.txt")) - count) <= 1
 
 
+def test_a_run_that_is_stopped_by_hand_ends_with_the_three_lines(model, tmp_path):
+    """On standard error, of the scans so far; the exit status says that it was stopped."""
+    options = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    process = start("run", "--model", model, "--live", "--out", tmp_path / "out", **options)
+    for number, scan in enumerate(random_scans(4).astype(np.float64)):
+        process.stdin.write(json.dumps({"stamp": 0.1 * number, "ranges": scan.tolist()}) + "\n")
+        process.stdin.flush()
+        process.stdout.readline()
+    process.send_signal(signal.SIGINT)
+    _, errors = process.communicate(timeout=600)
+    assert process.returncode == 130
+    path, speed, trouble, last = errors.splitlines()[-4:]
+    assert path.startswith("path     4 scans, ")
+    assert speed.startswith("speed    ")
+    assert trouble == f"trouble  stopped: by Ctrl-C; look at {tmp_path / 'out' / 'report.html'}"
+    assert last == "rcnn-odom: interrupted"
+    assert len(steps_in(tmp_path / "out")) == 4
+    assert (tmp_path / "out" / "report.html").exists()
+
+
+def test_a_run_that_is_stopped_before_its_first_scan_has_no_lines(model, tmp_path, caplog):
+    caplog.set_level(logging.INFO)
+    stream = ScanStream("log", breaks_off([], KeyboardInterrupt()))
+    with pytest.raises(KeyboardInterrupt):
+        run(Odometer.from_onnx(model), stream, "tiny", tmp_path / "out")
+    assert caplog.messages == []
+    assert not (tmp_path / "out").exists()
+
+
 def test_bytes_that_are_no_text_are_a_line_that_is_no_scan(model):
     good = json.dumps({"ranges": random_scans(1)[0].tolist()}).encode()
     done = subprocess.run(
@@ -290,22 +320,22 @@ def test_live_without_a_scan(model, capsys, monkeypatch):
         (["a", "b", "--model", "all_round"], "give one INPUT or --live"),
         (["a.bag", "b.bag", "--out", "x"], "give one INPUT or --live"),
         (["a"], "--out DIR is needed"),
-        (["a", "--out", "x", "--threads", "2"], "--threads is of a network (--model), not of the matcher"),
+        (["a", "--out", "x", "--threads", "2"], "--threads works only with a network (--model)"),
         (
             ["a", "--out", "x", "--model", "b.onnx", "--wheels"],
-            "--wheels is of the matcher, not of a network",
+            "--wheels works only with the matcher, not with a network",
         ),
-        (["a", "--out", "x", "--model", "b.onnx", "--deskew", "on"], "--deskew is of the matcher"),
+        (["a", "--out", "x", "--model", "b.onnx", "--deskew", "on"], "--deskew works only with the matcher"),
         (
             ["a", "--out", "x", "--model", "all_round", "--odom-topic", "/odom"],
-            "--odom-topic is of the matcher",
+            "--odom-topic works only with the matcher",
         ),
         (["a", "--out", "x", "--deskew", "perhaps"], "invalid choice: 'perhaps'"),
-        (["--live", "--ring", "3"], "--ring is of recordings, not of --live"),
-        (["--live", "--base", "base_link"], "--base is of recordings, not of --live"),
-        (["--live", "--wheels"], "--wheels is of recordings, not of --live"),
-        (["a", "--out", "x", "--base", "b", "--laser-pose", "1", "0", "0"], "say the same; give one of them"),
-        (["a", "--out", "x", "--wheels", "--odom-topic", "/o"], "are two odometries; give one of them"),
+        (["--live", "--ring", "3"], "--ring works only with recordings"),
+        (["--live", "--base", "base_link"], "--base works only with recordings"),
+        (["--live", "--wheels"], "--wheels works only with recordings"),
+        (["a", "--out", "x", "--base", "b", "--laser-pose", "1", "0", "0"], "both set the pose of the laser"),
+        (["a", "--out", "x", "--wheels", "--odom-topic", "/o"], "choose different odometry"),
         (
             ["a", "--out", "x", "--laser-pose", "1", "2"],
             "'1 2' is not three numbers, metres, metres and degrees",
@@ -396,9 +426,9 @@ def test_a_laser_that_starts_slowly_is_judged_by_several_scans(model, tmp_path):
 def test_a_laser_that_is_another_one_from_the_start_leaves_nothing(model, tmp_path):
     message, written = start_of(scans_of(*[np.arange(0.0, 180.0)] * 40), model, tmp_path / "out")
     assert message == (
-        "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, the sensor's from -90 to 90 "
-        "degrees, one every 1; take --model matcher, which fits any laser, or train a model on recordings of "
-        "such a laser (rcnn-odom train data=... data.sensor.field_of_view_deg=180 "
+        "robot.bag: scan 5: its beams lie from 0 to 179 degrees, one every 1, but the sensor's lie from -90 "
+        "to 90 degrees, one every 1; take --model matcher, which fits any laser, or train a model on "
+        "recordings of such a laser (rcnn-odom train data=... data.sensor.field_of_view_deg=180 "
         "data.sensor.resolution_deg=1 data.sensor.facing_deg=90)"
     )
     assert written == 0
@@ -753,7 +783,7 @@ def test_every_third_scan_in_two_ways(asked, tmp_path, capsys):
         assert [step["stamp"] for step in steps_in(out)] == stamps.tolist()
     with pytest.raises(SystemExit):
         main(["run", f"{log}[::3]", "--every", "3", "--out", str(tmp_path / "b")])
-    assert "--every and [::3] say the same" in capsys.readouterr().err
+    assert "--every and [::3] have the same meaning" in capsys.readouterr().err
 
 
 def test_the_poses_of_a_robot_whose_laser_sits_aside(asked, tmp_path, capsys):
@@ -785,8 +815,8 @@ def test_the_wheels_of_a_log_or_none(asked, monkeypatch, tmp_path, capsys):
     assert len(steps_in(tmp_path / "out0")) == 5
     assert asked.made == (True, True)
     assert (
-        "robot.log: has no odometry of the robot with its scans; leave --wheels out; of a bag, name its "
-        "topic: --odom-topic" in capsys.readouterr().err
+        "robot.log: its scans have no wheel odometry; leave out --wheels; for a bag, name its topic "
+        "with --odom-topic" in capsys.readouterr().err
     )
 
 
@@ -876,7 +906,7 @@ def test_the_time_of_a_turn_counts_where_a_user_says_so(asked, monkeypatch, desk
 def test_the_name_that_the_matcher_had(capsys):
     assert main(["run", "a.bag", "--out", "x", "--model", "icp"]) == 1
     assert capsys.readouterr().err == (
-        "rcnn-odom: error: --model icp has become --model matcher, the default; leave --model out\n"
+        "rcnn-odom: error: --model icp is now --model matcher, the default; leave out --model\n"
     )
 
 

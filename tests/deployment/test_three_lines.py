@@ -32,7 +32,7 @@ def test_a_run_without_trouble():
     assert format_lines(summary_of(), Path("my runs") / "report.html").splitlines() == [
         "path     1000 scans, 128.1 m driven; ended 5.0 m from the start (3.0 m behind, 4.0 m left), turned "
         "90 degrees left",
-        "speed    0.55 ms a scan, 180 times as fast as the recording (reading it aside); the robot drove "
+        "speed    0.55 ms a scan, 180 times as fast as the recording (without reading it); the robot drove "
         "1.28 m/s on average, 2.50 m/s at most",
         "trouble  none; look at 'my runs/report.html'",
     ]
@@ -59,7 +59,7 @@ def test_poses_of_the_robot_are_told_as_such():
 def test_without_stamps_no_speed_is_told():
     marked = {"held": [stretch(3, 3, rate=None), stretch(20, 24, 5, rate=None)]}
     lines = three_lines(summary_of(recording_s=None, speed=None, marked=marked))
-    assert lines["speed"] == "0.55 ms a scan; the scans have no time stamps, so that no speed is known"
+    assert lines["speed"] == "0.55 ms a scan; the scans have no time stamps, so the speed is unknown"
     assert lines["trouble"] == "held: 6 scans, scan 3, scans 20 to 24"
 
 
@@ -72,7 +72,7 @@ def test_trouble_is_told_by_cause_and_stays_short():
     trouble = three_lines(summary_of(marked=marked, skipped=skipped, stopped="it broke off"))["trouble"]
     one = "53 scans, from 31.2 s to 32.4 s, at 40.0 s, ..."
     assert trouble == (
-        f"no returns: {one}; held: {one}; gap: {one}; 2 more kinds; skipped: 6 lines that are no scan; "
+        f"no returns: {one}; held: {one}; gap: {one}; 2 more causes; skipped: 6 lines that are no scan; "
         "stopped: it broke off"
     )
 

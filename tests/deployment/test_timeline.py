@@ -37,6 +37,8 @@ def seconds_of(*stamps):
         ((9.0, 10.0, 2.0, 3.0, 4.0, 5.0, 6.0, 7.0), [0, 1, 1, 1, 1, 1, 1, 2]),  # set back by eight seconds
         ((None, None, 5.0, None, 6.0), [None, None, 0, 0, 1]),
         ((None, math.nan), [None, None]),
+        ([5.0] * 8 + [6.0] * 8 + [7.0], [0] * 8 + [1] * 8 + [2]),  # a clock of whole seconds
+        ((5.0, 5.0, 5.0, 6.0, 5.9, 7.0), [0, 0, 0, 1, 1, 2]),
     ],
 )
 def test_the_time_of_a_recording(stamps, expected):
@@ -145,7 +147,7 @@ def test_marked_scans_near_each_other_are_one_stretch():
         {"from_s": 4.0, "to_s": 4.0, "first_scan": 40, "last_scan": 40, "scans": 1},
         {"from_s": 6.0, "to_s": 6.1, "first_scan": 60, "last_scan": 61, "scans": 2},
     ]
-    assert marks.words["held"] == "held: it was so"
+    assert marks.first_notes["held"] == "held: it was so"
 
 
 def test_of_many_stretches_neighbours_become_one_and_no_scan_is_lost():

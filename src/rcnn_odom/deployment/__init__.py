@@ -1,4 +1,4 @@
-"""One scan in, one pose out; needs neither torch nor Lightning.
+"""Odometry in a stream, one pose for each scan; needs neither PyTorch nor Lightning.
 
 >>> from rcnn_odom.deployment import Odometer
 """
@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from rcnn_odom.deployment.odometer import Pose as Pose
 
 LAZY = ("Odometer", "Pose")
-"""Loaded when first asked for, since they need numpy, which the package alone does not."""
+"""Imported at first use, because they need numpy, which the package itself does not need."""
 
 
 def __getattr__(name: str) -> Any:

@@ -1,14 +1,14 @@
-"""What a pose may suffer from, in words for people: what happened, and what to do about it."""
+"""The causes of marked scans, in words for people: what happened, and what to do about it."""
 
 from typing import NamedTuple
 
 
 class Cause(NamedTuple):
-    """One kind of trouble.
+    """One cause for which scans are marked.
 
     Attributes:
-        happened: what it was, and what became of the step.
-        advice: what to do.
+        happened: what was wrong, and what was done about the step.
+        advice: what the user can do.
     """
 
     happened: str
@@ -16,101 +16,102 @@ class Cause(NamedTuple):
 
 
 HELP_MATCHER = (
-    "give the wheels' odometry if there is one (--wheels, --odom-topic); in a tunnel try --model fused"
+    "use the wheel odometry if it was recorded (--wheels, --odom-topic); in a tunnel try --model fused"
 )
 
 CAUSES = {
     "no returns": Cause(
-        "nothing came back, or nothing of use; the last motion went on",
-        "see whether something covered the laser or all walls were out of its range",
+        "the scan had no returns, or none that could be used; the last motion was repeated",
+        "check whether something covered the laser or all walls were out of its range",
     ),
     "few returns": Cause(
-        "too little came back; the matcher let the last motion go on, a network used what there was",
-        f"see what was around the robot there; {HELP_MATCHER}",
+        "the scan had few returns; the matcher repeated the last motion, a network used what there was",
+        f"check what was around the robot there; {HELP_MATCHER}",
     ),
     "no match": Cause(
-        "the scan does not fit what was seen before; the last motion went on",
+        "the scan does not fit the local map; the last motion was repeated",
         f"use every scan (no --every); {HELP_MATCHER}",
     ),
     "new map": Cause(
-        "six scans in a row did not fit, so that a new map began",
-        "do not trust how the path before is joined to the path after it",
+        "six scans in a row did not fit the local map, so a new map was begun",
+        "do not trust the position of the path after it relative to the path before it",
     ),
     "held": Cause(
-        "nothing seen determines the motion along a direction, as in a bare corridor; the last motion went "
-        "on along it",
+        "the scan does not determine the motion along one direction, as in a bare corridor; along it the "
+        "last motion was repeated",
         f"do not trust the distance there; {HELP_MATCHER}",
     ),
     "poor match": Cause(
-        "much of the scan does not fit: people, a door that opens, a new room; the match stands",
+        "much of the scan does not fit the map (people, a door that opens, a new room); the match was used",
         "nothing, unless walls are doubled in the map",
     ),
     "sudden motion": Cause(
-        "half a metre or 20 degrees away from where the last motion led; the match stands",
-        "see whether scans are missing or the robot was pushed; if neither, the match may be wrong",
+        "the motion differs from the last one by half a metre or 20 degrees; the match was used",
+        "check whether scans are missing or the robot was pushed; if neither, the match may be wrong",
     ),
     "ambiguous": Cause(
-        "the scan fits in two places nearly as well; the better one was taken",
+        "the scan fits the map almost equally well in two places; the better one was used",
         f"look for doubled walls in the map; {HELP_MATCHER}",
     ),
     "no prior": Cause(
-        "the network had no step; scan matching went on alone",
+        "the network gave no step; scan matching was used without it",
         "choose a --network that was trained for such a laser",
     ),
     "late scan": Cause(
-        "the stamp is not after the one before; the scan was passed over",
-        "stamp scans when they are measured, and record them in their order",
+        "the stamp is not later than the one before; the scan was not used",
+        "stamp scans when they are measured, and record them in that order",
     ),
     "clock set": Cause(
         "the stamps jumped by more than ten seconds; no motion was added",
-        "take the path before and after it for two drives",
+        "treat the path before it and the path after it as two drives",
     ),
     "to and fro": Cause(
-        "each step takes the one before it back, as where two lasers write to one topic",
-        "give each laser a topic of its own, and choose one with --topic",
+        "each step reverses the one before it, as if two lasers wrote to one topic",
+        "give each laser its own topic, and choose one with --topic",
     ),
     "other frame": Cause(
-        "a scan of another frame_id, as of another laser; it was passed over",
+        "the scan has another frame_id, as from another laser; it was not used",
         "choose the topic of one laser with --topic",
     ),
     "new frame": Cause(
-        "the laser's frame_id changed for good; no motion was added",
-        "take the path before and after it for two drives",
+        "the laser's frame_id changed and stayed different; no motion was added",
+        "treat the path before it and the path after it as two drives",
     ),
     "other laser": Cause(
-        "the beams do not lie where the network knows them; the scan was not used",
-        "take --model matcher, which fits any laser",
+        "the beams do not lie where the network expects them; the scan was not used",
+        "use --model matcher, which works with any laser",
     ),
     "gap": Cause(
-        "scans are missing; the last motion went on over the gap",
-        "find out why the recording lost scans; --model matcher matches across gaps",
+        "scans are missing; a network that measures residual motions compared the scans at both ends of the "
+        "gap, another network repeated the last motion",
+        "find out why the recording lost scans; --model matcher matches across gaps as well",
     ),
     "slow scans": Cause(
-        "more time between scans than in the network's training",
-        "use every scan (no --every), or take --model matcher",
+        "the time between scans is longer than in the network's training",
+        "use every scan (no --every), or --model matcher",
     ),
     "fast scans": Cause(
-        "less time between scans than in the network's training",
-        "use fewer scans (--every), or take --model matcher",
+        "the time between scans is shorter than in the network's training",
+        "use fewer scans (--every), or --model matcher",
     ),
     "beam count": Cause(
-        "another number of beams than before",
+        "the number of beams changed",
         "nothing, if the laser's settings were changed on purpose",
     ),
     "no estimate": Cause(
-        "the network gave no number; the last motion went on",
-        "take --model matcher there",
+        "the network gave no finite numbers; the last motion was repeated",
+        "use --model matcher there",
     ),
 }
-"""By the kind that stands before the colon in ``degraded``."""
+"""By the cause, the text before the colon in a note of ``degraded``."""
 
 
-def explain(cause: str, words: str = "") -> Cause:
-    """What is known of a kind of trouble; of one that another package adds, its own words.
+def explain(cause: str, notes: str = "") -> Cause:
+    """Explains a cause; one that is not in the table, of a model from another package, by its own note.
 
     Args:
-        cause: the kind.
-        words: of the first pose that suffers from it.
+        cause: text before the colon in a note.
+        notes: ``degraded`` of the first pose that is marked for this cause.
     """
-    own = next((note for note in words.split("; ") if note.startswith(f"{cause}:")), "")
+    own = next((note for note in notes.split("; ") if note.startswith(f"{cause}:")), "")
     return CAUSES.get(cause) or Cause(own.partition(": ")[2], "see the documentation of the model")

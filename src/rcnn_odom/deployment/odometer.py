@@ -1,4 +1,4 @@
-"""Streaming odometry: one scan in, one pose out, in constant memory."""
+"""Odometry in a stream: a pose for each scan, in constant memory."""
 
 import math
 import shlex
@@ -22,13 +22,13 @@ from rcnn_odom.geometry import (
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
-from rcnn_odom.models.streaming import ScanTracker
+from rcnn_odom.models.streaming import Description, ScanTracker
 from rcnn_odom.models.tracking import Kind, Tracking, no_step
 from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.recordings.scan import Scan
 
 LaserPose = tuple[float, float, float]
-"""x and y in metres and heading in radians of a laser on its robot."""
+"""Pose of a laser on its robot: x and y in metres and heading in radians."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,16 +38,17 @@ class Pose:
     If the odometer knows the pose of the laser on the robot, pose and step are those of the robot.
 
     Attributes:
-        stamp: seconds, of the scan; None if it has none.
+        stamp: stamp of the scan in seconds; None if it has none.
         x, y: metres ahead and to the left of the first pose.
         heading: radians, counter-clockwise, not wrapped.
-        step: from the previous pose. Its covariance is nan if the model gives none. A network's covariance is
-            fitted so that 68 % of the errors on validation drives lie within one standard deviation. If the
-            last motion was only repeated, the deviations are as large as typical motions.
-        covariance: (3, 3) of x, y and heading in the frame of the first pose, accumulated over the steps; for
-            a network as if their errors were independent. After a step of unknown covariance the entries that
-            depend on it stay nan.
-        degraded: why the estimate is worse than usual for its model, in words; otherwise empty.
+        step: motion since the previous pose. Its covariance is nan if the model gives none. A network's
+            covariance is fitted so that 68 % of the errors on validation drives lie within one standard
+            deviation. If the last motion was only repeated, the deviations are as large as typical motions.
+        covariance: (3, 3) of x, y and heading in the frame of the first pose, accumulated over the steps. The
+            errors of a network's steps are treated as independent. After a step of unknown covariance the
+            entries that depend on it stay nan.
+        degraded: notes on why the estimate is worse than usual for its model, separated by semicolons;
+            otherwise empty.
 
     Example:
         >>> pose = Pose(stamp=0.5, x=1.0, y=2.0, heading=np.pi / 2)  # 1 m ahead, 2 m to the left, turned left
@@ -69,7 +70,7 @@ class Pose:
     degraded: str = ""
 
     def matrix(self) -> FloatArray:
-        """The transform (4, 4) from the laser's, or the robot's, frame to the frame of the first pose."""
+        """The transform (4, 4) from the frame of the laser, or the robot, to the frame of the first pose."""
         return planar_to_poses([[self.x, self.y, self.heading]])[0]
 
     def as_dict(self) -> dict[str, Any]:
@@ -91,21 +92,22 @@ def _without_nan(covariance: FloatArray) -> list[list[float | None]]:
 
 
 class Odometer:
-    """Poses from the scans of one laser, in their order.
+    """Computes poses from the scans of one laser, which are given in order.
 
-    Problems of the stream raise no error. The pose's ``degraded`` then says what happened, beginning with its
-    kind and a colon. The kinds are documented in :class:`rcnn_odom.models.tracking.Tracking` for stamps and
-    frames, in :class:`rcnn_odom.models.pairs.PairTracker` for networks and in
+    Problems of the stream raise no error. Instead, ``degraded`` of the pose holds a note on each problem,
+    which begins with the kind of the problem and a colon. The kinds are documented in
+    :class:`rcnn_odom.models.tracking.Tracking` for stamps and frames, in
+    :class:`rcnn_odom.models.pairs.PairTracker` for networks and in
     :class:`rcnn_odom.models.matcher.MatcherTracker` for scan matching.
 
     Args:
         tracker: the model; None for scan matching, which needs no training and works with any 2D laser.
-        laser_pose: x and y in metres and heading in radians of the laser on the robot, for poses of the
-            robot; None for poses of the laser.
+        laser_pose: pose of the laser on the robot, to get poses of the robot; x and y in metres and heading
+            in radians. None to get poses of the laser.
 
     Attributes:
         tracker, laser_pose: as given.
-        estimates: number of steps that were estimated from their scan.
+        estimates: number of steps that were estimated from their scans.
 
     Example:
         A square room of 8 m, seen from its centre and then from 1 m ahead:
@@ -136,17 +138,17 @@ class Odometer:
         threads: int = 1,
         laser_pose: LaserPose | None = None,
     ) -> "Odometer":
-        """The network of a file written by ``rcnn-odom export``, computed by ONNX Runtime.
+        """Makes an odometer with the network in a file of ``rcnn-odom export``, run by ONNX Runtime.
 
         Args:
-            path: the file, or the name of a model that ships with the project, ``all_round`` or
+            path: the file, or the name of a network that ships with the project: ``all_round`` or
                 ``half_circle``.
-            sensor: the sensor for which it must have been trained; None for any.
+            sensor: the sensor for which the network must have been trained; None for any.
             threads: number of threads of the computation.
-            laser_pose: as above.
+            laser_pose: as in the class.
 
         Raises:
-            InputError: there is no such file, it was not written by ``rcnn-odom export``, or it was trained
+            InputError: the file does not exist, was not written by ``rcnn-odom export``, or holds a network
                 for another sensor.
 
         Example:
@@ -157,13 +159,13 @@ class Odometer:
         stepper = OnnxStepper(find_file(path), threads)
         if sensor is not None and stepper.description.sensor != sensor:
             raise InputError(
-                f"{path}: made for {stepper.description.sensor}, not {sensor}; take a fitting one"
+                f"{path}: trained for {stepper.description.sensor}, not {sensor}; use another network"
             )
         return cls(PairTracker(stepper), laser_pose)
 
     @classmethod
     def from_checkpoint(cls, path: str | Path) -> "Odometer":
-        """Says how to use a checkpoint, which has to be exported first.
+        """Raises an error that says how to use a checkpoint, which must be exported first.
 
         Raises:
             InputError: always.
@@ -171,11 +173,11 @@ class Odometer:
         Example:
             >>> Odometer.from_checkpoint("best.ckpt")
             Traceback (most recent call last):
-            rcnn_odom.errors.InputError: best.ckpt: a checkpoint is exported before it runs: ...
+            rcnn_odom.errors.InputError: best.ckpt: a checkpoint must be exported first: ...
         """
         raise InputError(
-            f"{path}: a checkpoint is exported before it runs: rcnn-odom export {shlex.quote(str(path))}, "
-            f"then Odometer.from_onnx; at once: rcnn_odom.training.export.load_odometer({str(path)!r})"
+            f"{path}: a checkpoint must be exported first: rcnn-odom export {shlex.quote(str(path))}, then "
+            f"Odometer.from_onnx; both in one call: rcnn_odom.training.export.load_odometer({str(path)!r})"
         )
 
     def reset(self) -> None:
@@ -189,36 +191,43 @@ class Odometer:
             0
         """
         self._tracking = Tracking(self.tracker)
-        self._position, self._covariance, self._last_pose = np.zeros(3), AccumulatedCovariance(), Pose()
+        self._planar_pose, self._covariance, self._last_pose = np.zeros(3), AccumulatedCovariance(), Pose()
         self._is_used, self.estimates = False, 0
 
     @property
     def has_seen(self) -> bool:
-        """Whether there is a scan with returns that the next one can be compared with."""
+        """Whether there is an earlier scan with returns, with which the next one can be compared."""
         return self.tracker.has_seen
 
     @property
     def beam_check(self) -> BeamCheck | None:
-        """Compares the beams of scans with those a network knows; None if the model works with any laser."""
+        """Compares the beams of scans with those of the network's sensor; None if any laser works."""
         return self.tracker.beam_check if isinstance(self.tracker, PairTracker) else None
 
     @property
     def sensor(self) -> Sensor | None:
-        """The laser for which a network was trained; None if the model works with any."""
+        """The laser for which the network was trained; None if the model works with any laser."""
         return self.tracker.description.sensor if isinstance(self.tracker, PairTracker) else None
+
+    @property
+    def network(self) -> Description | None:
+        """Description of the network that gives the steps, or the priors of the matcher; None without one."""
+        description: Description | None = getattr(self.tracker, "description", None)
+        return description
 
     def step(
         self, scan: Scan | npt.ArrayLike, stamp: float | None = None, angles: npt.ArrayLike | None = None
     ) -> Pose:
-        """The pose at one more scan.
+        """Computes the pose of one more scan.
 
         Args:
             scan: a :class:`Scan`, which has its own stamp and bearings; or ranges (P,) in metres,
                 counter-clockwise; or points (P, 2 or more), x ahead and y to the left in metres. A range that
-                is not positive, not finite, or at least a network's maximum range is no return.
-            stamp: seconds, for ranges or points. Without one (None, nan) the scan is taken as the next one.
-            angles: (P,) bearings of the ranges in radians, 0 ahead, counter-clockwise. None, for networks
-                only: evenly spaced over the sensor's field of view, from its right end or from behind.
+                is not positive, not finite, or at least a network's maximum range counts as no return.
+            stamp: seconds, for ranges or points. If it is None or nan, one period is assumed to have passed.
+            angles: (P,) bearings of the ranges in radians, 0 ahead, counter-clockwise. None is allowed for
+                networks only, and means beams that are spread evenly over the sensor's field of view, from
+                its right end or, if it is a full circle, from behind.
 
         Raises:
             ValueError: the shapes of the arrays do not match, or the bearings of the beams are unknown.
@@ -226,23 +235,23 @@ class Odometer:
         if not isinstance(scan, Scan):
             scan = _as_scan(scan, stamp, angles)
         if scan.bearings is None and self.sensor is None:
-            raise ValueError("ranges without angles say nothing of any laser; give the angles of the beams")
-        found = self._tracking.step(scan)
-        self._is_used = found.kind is not Kind.PASSED_OVER
-        degraded = "; ".join(found.notes)
+            raise ValueError("ranges without angles do not define a scan; give the angles of the beams")
+        tracked = self._tracking.step(scan)
+        self._is_used = tracked.kind is not Kind.PASSED_OVER
+        degraded = "; ".join(tracked.notes)
         if not self._is_used:
-            return replace(self._last_pose, step=found.step, degraded=degraded)
-        self.estimates += found.kind is Kind.ESTIMATED
-        step = found.step if self.laser_pose is None else change_step_frame(found.step, self.laser_pose)
-        self._covariance.add(self._position, step)
-        self._position = advance(self._position, step.array())
+            return replace(self._last_pose, step=tracked.step, degraded=degraded)
+        self.estimates += tracked.kind is Kind.ESTIMATED
+        step = tracked.step if self.laser_pose is None else change_step_frame(tracked.step, self.laser_pose)
+        self._covariance.add(self._planar_pose, step)
+        self._planar_pose = advance(self._planar_pose, step.array())
         stamp = None if scan.stamp is None or not math.isfinite(scan.stamp) else float(scan.stamp)
-        x, y, heading = self._position.tolist()
+        x, y, heading = self._planar_pose.tolist()
         self._last_pose = Pose(stamp, x, y, heading, step, self._covariance.value, degraded)
         return self._last_pose
 
     def returns(self) -> npt.NDArray[np.float32]:
-        """Points (P, 2) in metres of the last scan in the frame of the first pose.
+        """The returns of the last scan as points (P, 2) in metres, in the frame of the first pose.
 
         Empty if the last scan had no return or was not used.
 
@@ -257,7 +266,7 @@ class Odometer:
         return self._from_laser(self.tracker.returns())
 
     def local_map(self) -> npt.NDArray[np.float32] | None:
-        """Points (C, 2) in metres of the map of scan matching, in the frame of the first pose.
+        """The map of scan matching as points (C, 2) in metres, in the frame of the first pose.
 
         None if the model keeps no map.
 
@@ -271,11 +280,13 @@ class Odometer:
         return None if map_points is None else self._from_laser(map_points())
 
     def _from_laser(self, points: FloatArray) -> npt.NDArray[np.float32]:
-        """Points (P, 2) from the laser's frame to the frame of the first pose."""
-        place = (
-            self._position if self.laser_pose is None else advance(self._position, np.array(self.laser_pose))
+        """Transforms points (P, 2) from the laser's frame to the frame of the first pose."""
+        planar = (
+            self._planar_pose
+            if self.laser_pose is None
+            else advance(self._planar_pose, np.array(self.laser_pose))
         )
-        pose = planar_to_poses(place[None])[0]
+        pose = planar_to_poses(planar[None])[0]
         return (points @ pose[:2, :2].T + pose[:2, 3]).astype(np.float32)
 
 

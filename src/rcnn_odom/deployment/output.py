@@ -1,4 +1,4 @@
-"""What a run writes beside its folder: one interface, and what all such outputs have in common.
+"""Outputs of a run beside its folder: their interface, and what all of them have in common.
 
 Another output is one more file with a class like :class:`rcnn_odom.deployment.mcap_log.McapLog`.
 """
@@ -15,65 +15,69 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.deployment.odometer import Odometer, Pose
-from rcnn_odom.deployment.timeline import LEAST_APART, Stretch, causes_in
+from rcnn_odom.deployment.timeline import STRETCH_GAP, Stretch, causes_in
 from rcnn_odom.errors import InputError
 from rcnn_odom.models.tracking import PASSED_OVER
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 
 LATEST_STAMP = 2.0**31
-"""Seconds from which on a stamp counts as none: messages of ROS cannot hold it, and no clock says it."""
+"""Seconds; a larger stamp is ignored, because ROS messages cannot hold it and no clock gives it."""
 USUAL_PERIOD = 0.1
-"""Seconds between scans without stamps, where the model knows no period."""
+"""Seconds between scans without stamps if the model has no period of its own."""
 MAP_EVERY = 50
 """Scans between two local maps that are written."""
 RECENT_SCANS, RECENT_EVERY, RECENT_POINTS = 20, 5, 500
-"""Scans that the local map of a model without one is made of, every so many scans one, and points of each."""
+"""For a model without a map: number of recent scans that make up the local map, scans from one of them to the
+next, and maximum number of points of each."""
 
 
 class Output(Protocol):
-    """Takes the poses of a run as they come, in constant memory.
+    """Receives the poses of a run one by one, in constant memory.
 
-    Where it writes to is checked when it is made, before anything is read.
+    Its constructor checks that it can be written, before anything is read.
     """
 
     def open(self, stream: ScanStream, odometer: Odometer) -> None:
-        """Gets to know a run that begins; nothing is written yet.
+        """Prepares for a run that begins; nothing is written yet.
 
         Args:
             stream: the scans.
-            odometer: at its start; after each scan it tells of the local map.
+            odometer: at its start. After each scan it holds the returns and the local map of that scan.
         """
 
     def add(self, pose: Pose, scan: Scan) -> None:
-        """One more pose, with the scan that was taken there.
+        """Writes one more pose, with the scan that was taken there.
 
         Raises:
-            InputError: it cannot be written.
-            OSError: it can no longer be written.
+            InputError: the output cannot be created.
+            OSError: the output can no longer be written.
         """
 
     def finish(self, keep: bool) -> None:
-        """Completes what was written, also where the run breaks off; or removes it, where no scan was usable.
+        """Completes what was written, also if the run was interrupted.
+
+        Args:
+            keep: False if no scan could be used: what was written is then removed.
 
         Raises:
-            OSError: it can no longer be written.
+            OSError: the output can no longer be written.
         """
 
 
 class OutputFile:
-    """A file that a run writes: it must not exist yet, and is removed where no scan can be used.
+    """A file that a run writes: it must not exist yet, and is removed if no scan can be used.
 
     Args:
-        path: of the file; its folder is made where missing.
-        option: of the command line, by which it was chosen, for messages.
-        ending: that it must have.
+        path: of the file; its folder is created if it does not exist.
+        option: of the command line that names the file, for messages.
+        ending: that the path must have.
 
     Attributes:
         path: as given.
 
     Raises:
-        InputError: it has another ending, exists already, or its folder cannot be written.
+        InputError: the path has another ending, exists already, or its folder cannot be written.
     """
 
     def __init__(self, path: Path, option: str, ending: str) -> None:
@@ -81,11 +85,11 @@ class OutputFile:
         if path.suffix.lower() != ending:
             raise InputError(f"{path}: does not end in {ending}; choose another {option}")
         self._refuse_existing()
-        self._made = [each for each in path.parents if not os.path.lexists(each)]
-        there = path.parents[len(self._made)]
-        if not there.is_dir():
+        self._new_folders = [each for each in path.parents if not os.path.lexists(each)]
+        parent = path.parents[len(self._new_folders)]
+        if not parent.is_dir():
             raise self._refusal("Not a directory")
-        if not os.access(there, os.W_OK | os.X_OK):
+        if not os.access(parent, os.W_OK | os.X_OK):
             raise self._refusal("Permission denied")
 
     def _refuse_existing(self) -> None:
@@ -96,10 +100,10 @@ class OutputFile:
         return InputError(f"{self.path}: cannot be written ({reason}); choose another {self._option}")
 
     def make_folder(self) -> None:
-        """Makes the folder, at the last moment.
+        """Creates the folder, just before the file is written.
 
         Raises:
-            InputError: that fails, or the file exists by now.
+            InputError: the folder cannot be created, or the file exists by now.
         """
         self._refuse_existing()
         try:
@@ -108,25 +112,28 @@ class OutputFile:
             raise self.cannot_write(error) from error
 
     def cannot_write(self, error: Exception) -> InputError:
-        """The refusal for a user of what the system said."""
+        """Turns an error of the system or of a library into a message for the user."""
         return self._refusal(getattr(error, "strerror", None) or str(error).splitlines()[0])
 
     def remove(self) -> None:
-        """Leaves nothing behind of it and of folders that were made for it."""
-        with suppress(OSError):  # it was never made
+        """Removes the file, and the folders that were created for it."""
+        with suppress(OSError):  # the file was never created
             self.path.unlink(missing_ok=True)
-        for folder in self._made:
-            with suppress(OSError):  # somebody else has put something there
+        for folder in self._new_folders:
+            with suppress(OSError):  # the folder holds other files by now
                 folder.rmdir()
 
 
 class Stamps:
-    """Seconds of a run's scans: those of the recording, or where it has none a period after the last one.
+    """Times of a run's scans in seconds: their stamps, or one period after the last time without a stamp.
 
-    What is negative, after 2038, or 0 after the first scan, is none.
+    A stamp that is negative, after the year 2038, or 0 after the first scan counts as none.
 
     Args:
         period: usual seconds between scans; nan: unknown.
+
+    Attributes:
+        is_recorded: whether the last time is a stamp of the recording.
 
     Example:
         >>> stamps = Stamps(0.5)
@@ -136,24 +143,25 @@ class Stamps:
 
     def __init__(self, period: float) -> None:
         self.period = period if 0 < period < math.inf else USUAL_PERIOD
+        self.is_recorded = False
         self._last: float | None = None
 
     def next(self, stamp: float | None) -> float:
-        """The seconds of one more scan."""
+        """Returns the time of the next scan in seconds."""
         if stamp is not None and 0 <= stamp < LATEST_STAMP and (stamp > 0 or self._last is None):
-            self._last = float(stamp)
+            self.is_recorded, self._last = True, float(stamp)
         else:
-            self._last = (self._last or 0.0) + self.period
+            self.is_recorded, self._last = False, (self._last or 0.0) + self.period
         return self._last
 
 
 @dataclass(frozen=True)
 class Remark:
-    """Words about a stretch of poses.
+    """A message about the quality of the poses.
 
     Attributes:
         text: for people.
-        is_warning: the estimate is worse than usual from here on; otherwise that is over.
+        is_warning: True if the estimate is worse than usual from here on, False if that is over.
     """
 
     text: str
@@ -161,9 +169,10 @@ class Remark:
 
 
 class Remarks:
-    """Tells once where poses begin to suffer from something, and once where that is over.
+    """Reports the beginning and the end of each stretch of poses that are worse than usual.
 
-    It is over after some scans without it: closer stretches are one, as in the report.
+    A stretch ends after some scans without its cause; stretches that are closer together count as one, as in
+    the report.
     """
 
     def __init__(self) -> None:
@@ -171,7 +180,13 @@ class Remarks:
         self._open: dict[str, Stretch] = {}
 
     def add(self, degraded: str) -> list[Remark]:
-        """What there is to tell of one more pose, in whose words stands what it suffers from."""
+        """Returns the remarks on one more pose, from the notes in its ``degraded``.
+
+        Example:
+            >>> remarks = Remarks()
+            >>> [len(remarks.add(degraded)) for degraded in ("", "gap: 3 periods", "gap: 2 periods", "")]
+            [0, 1, 0, 0]
+        """
         self._scans += 1
         number, remarks = self._scans, list[Remark]()
         for note in degraded.split("; "):
@@ -182,25 +197,26 @@ class Remarks:
                 else:
                     self._open[cause] = here
                     remarks.append(Remark(note, is_warning=True))
-        over = [cause for cause, one in self._open.items() if number - one.last > LEAST_APART]
-        for cause in over:
+        ended = [cause for cause, one in self._open.items() if number - one.last > STRETCH_GAP]
+        for cause in ended:
             one = self._open.pop(cause)
-            text = f"{cause}: over, {one.scans} scans from the {one.first}. to the {one.last}."
+            scans = f"{one.scans} scan{'s' if one.scans != 1 else ''}"
+            text = f"{cause}: over, {scans} marked from scan {one.first} to scan {one.last}"
             remarks.append(Remark(text, is_warning=False))
         return remarks
 
 
-def thinned(points: npt.NDArray[np.float32], most: int) -> npt.NDArray[np.float32]:
-    """Every so many of points (P, 2), that at most ``most`` are left.
+def thin_points(points: npt.NDArray[np.float32], most: int) -> npt.NDArray[np.float32]:
+    """Keeps every n-th of points (P, 2), with the smallest n that leaves at most ``most`` points.
 
-    >>> thinned(np.zeros((10, 2), np.float32), 4).shape
+    >>> thin_points(np.zeros((10, 2), np.float32), 4).shape
     (4, 2)
     """
     return points[:: max(1, -(-len(points) // most))]
 
 
 class LocalMaps:
-    """The local map that outputs draw: the matcher's own, or else the returns of recent scans.
+    """The local map that outputs show: that of the matcher, or the returns of recent scans.
 
     Args:
         odometer: at its start.
@@ -212,10 +228,14 @@ class LocalMaps:
         self._recent: deque[npt.NDArray[np.float32]] = deque(maxlen=RECENT_SCANS)
 
     def add(self) -> npt.NDArray[np.float32] | None:
-        """Points (C, 2) in metres in the frame of the first pose, after one more scan; None: not yet due."""
+        """Counts one more scan.
+
+        Returns:
+            Points (C, 2) in metres in the frame of the first pose; None if no map is due at this scan.
+        """
         number, self._count = self._count, self._count + 1
         if not self._has_own and number % RECENT_EVERY == 0:
-            self._recent.append(thinned(self._odometer.returns(), RECENT_POINTS))
+            self._recent.append(thin_points(self._odometer.returns(), RECENT_POINTS))
         if number % MAP_EVERY:
             return None
         return self._odometer.local_map() if self._has_own else np.concatenate(list(self._recent))
@@ -226,8 +246,8 @@ def is_passed_over(pose: Pose) -> bool:
     return pose.degraded.startswith(PASSED_OVER)
 
 
-def with_bearings(scan: Scan, odometer: Odometer) -> Scan:
-    """A scan with the bearings of its beams, where only a network's sensor says them."""
+def add_bearings(scan: Scan, odometer: Odometer) -> Scan:
+    """A scan with bearings: its own, or those that the sensor of a network defines."""
     if scan.bearings is not None or odometer.sensor is None:
         return scan
     return replace(scan, bearings=odometer.sensor.bearings_of(scan))

@@ -1,4 +1,4 @@
-"""``report.html`` of one run: what a person wants to know of it, on one page that needs no other file."""
+"""``report.html`` of a run: its result for people, on one page that needs no other file."""
 
 import base64
 import html
@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from rcnn_odom.deployment.causes import explain
-from rcnn_odom.deployment.report_pictures import Seen, as_png, colours_of, pictures_of
+from rcnn_odom.deployment.report_pictures import MapScan, as_png, assign_colours, make_pictures
 from rcnn_odom.deployment.three_lines import three_lines
 from rcnn_odom.deployment.timeline import Timeline
 from rcnn_odom.files import write_atomically
@@ -52,28 +52,32 @@ tbody, tr { break-inside: avoid; }
 
 
 def write_page(
-    path: Path, summary: Summary, timeline: Timeline, seen: Sequence[Seen], settings: Mapping[str, str]
+    path: Path,
+    summary: Summary,
+    timeline: Timeline,
+    map_scans: Sequence[MapScan],
+    settings: Mapping[str, str],
 ) -> None:
-    """Writes the page, at once or not at all.
+    """Writes the page completely or not at all.
 
     Args:
         path: of the file.
         summary: of the run.
         timeline: of the run.
-        seen: some of its scans, in order, for the map.
-        settings: what the run was told and found, by name, in words.
+        map_scans: some of its scans, in order, for the map.
+        settings: options of the run and properties of the recording, by name, as text.
 
     Raises:
-        OSError: it cannot be written.
+        OSError: the file cannot be written.
     """
     title = f"Odometry of {summary['input']} by {summary['model']}"
-    parts = [f"<h1>{html.escape(title)}</h1>", _lines(summary)]
+    parts = [f"<h1>{html.escape(title)}</h1>", _summary_list(summary)]
     if stopped := summary.get("stopped"):
         parts.append(_warning(f"The run ended before the recording did: {stopped}"))
-    parts += _pictures(summary, timeline, seen)
-    parts += [_marked(summary, timeline.marks.words), _settings(settings)]
+    parts += _pictures(summary, timeline, map_scans)
+    parts += [_stretch_table(summary, timeline.marks.first_notes), _settings_table(settings)]
     page = _as_page(title, "\n".join(parts))
-    write_atomically(path, page.encode("utf-8", "replace"))  # names may hold bytes that are no text
+    write_atomically(path, page.encode("utf-8", "replace"))  # file names may hold invalid text
 
 
 def _as_page(title: str, body: str) -> str:
@@ -86,7 +90,7 @@ def _as_page(title: str, body: str) -> str:
     )
 
 
-def _lines(summary: Summary) -> str:
+def _summary_list(summary: Summary) -> str:
     rows = [f"<dt>{name}</dt><dd>{html.escape(line)}</dd>" for name, line in three_lines(summary).items()]
     return "\n".join(["<dl>", *rows, "</dl>"])
 
@@ -95,15 +99,15 @@ def _warning(text: str) -> str:
     return f'<p class="warning">{html.escape(text)}</p>'
 
 
-def _pictures(summary: Summary, timeline: Timeline, seen: Sequence[Seen]) -> Iterator[str]:
-    """All pictures, or one line where they cannot be drawn."""
+def _pictures(summary: Summary, timeline: Timeline, map_scans: Sequence[MapScan]) -> Iterator[str]:
+    """All pictures, or one line if they cannot be drawn."""
     try:
-        import matplotlib  # noqa: F401 - a robot may be without it
+        import matplotlib  # noqa: F401 - may not be installed on a robot
     except ImportError:
         log.warning(NO_PICTURES)
         yield _warning(NO_PICTURES)
         return
-    for picture in pictures_of(timeline, seen, three_lines(summary)["path"]):
+    for picture in make_pictures(timeline, map_scans, three_lines(summary)["path"]):
         data = base64.b64encode(as_png(picture.draw())).decode()
         yield (
             f"<h2>{html.escape(picture.heading)}</h2>\n<figure>\n"
@@ -112,30 +116,35 @@ def _pictures(summary: Summary, timeline: Timeline, seen: Sequence[Seen]) -> Ite
         )
 
 
-def _marked(summary: Summary, words: Mapping[str, str]) -> str:
-    """All marked stretches by their cause, with what to do; the words are the first note of each cause."""
+def _stretch_table(summary: Summary, first_notes: Mapping[str, str]) -> str:
+    """A table of all marked stretches by cause, with advice.
+
+    Args:
+        summary: of the run.
+        first_notes: by cause, the notes of the first pose that is marked for it.
+    """
     marked = summary["marked"]
     if not marked:
-        return "<h2>Marked stretches</h2>\n<p>None: no scan suffered from anything.</p>"
+        return "<h2>Marked stretches</h2>\n<p>None: no scan was marked.</p>"
     bodies = [
-        _cause_rows(cause, marked[cause], words[cause], colour)
-        for cause, colour in colours_of(list(marked)).items()
+        _cause_rows(cause, marked[cause], first_notes[cause], colour)
+        for cause, colour in assign_colours(list(marked)).items()
     ]
     about = (
         "Times are seconds of the recording; scans are numbered from 1, as the lines of steps.jsonl. Marked "
-        "scans close to each other are one stretch."
+        "scans that are close to each other form one stretch."
     )
     head = "<thead><tr><th>from</th><th>to</th><th>scans</th></tr></thead>"
     return "\n".join(["<h2>Marked stretches</h2>", f"<p>{about}</p>", "<table>", head, *bodies, "</table>"])
 
 
-def _cause_rows(cause: str, stretches: Sequence[Mapping[str, Any]], words: str, colour: str) -> str:
-    """One cause: what it is and what to do, and a row for each of its stretches."""
-    happened, advice = explain(cause, words)
+def _cause_rows(cause: str, stretches: Sequence[Mapping[str, Any]], notes: str, colour: str) -> str:
+    """One cause with its explanation and advice, and a row for each of its stretches."""
+    happened, advice = explain(cause, notes)
     count = sum(one["scans"] for one in stretches)
     rows = [
-        f"<tr><td>{_place(one['from_s'], one['first_scan'])}</td>"
-        f"<td>{_place(one['to_s'], one['last_scan'])}</td><td>{one['scans']}</td></tr>"
+        f"<tr><td>{_format_time(one['from_s'], one['first_scan'])}</td>"
+        f"<td>{_format_time(one['to_s'], one['last_scan'])}</td><td>{one['scans']}</td></tr>"
         for one in stretches
     ]
     head = (
@@ -146,11 +155,11 @@ def _cause_rows(cause: str, stretches: Sequence[Mapping[str, Any]], words: str, 
     return "\n".join(["<tbody>", head, *rows, "</tbody>"])
 
 
-def _place(seconds: float | None, scan: int) -> str:
+def _format_time(seconds: float | None, scan: int) -> str:
     return f"scan {scan}" if seconds is None else f"{seconds:.1f} s (scan {scan})"
 
 
-def _settings(settings: Mapping[str, str]) -> str:
+def _settings_table(settings: Mapping[str, str]) -> str:
     rows = [
         f"<tr><th>{html.escape(name)}</th><td>{html.escape(value)}</td></tr>"
         for name, value in settings.items()

@@ -1,10 +1,11 @@
-"""A run in the viewer of rerun, or as a file for it: ``rcnn-odom run --view`` and ``--rerun``."""
+"""A run in rerun's viewer, or as a file for it: ``rcnn-odom run --view`` and ``--rerun``."""
 
 import importlib.util
 import os
 import sys
 from abc import ABC, abstractmethod
 from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, distribution
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -17,8 +18,8 @@ from rcnn_odom.deployment.output import (
     OutputFile,
     Remarks,
     Stamps,
+    add_bearings,
     is_passed_over,
-    with_bearings,
 )
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import covariance_ellipse
@@ -26,30 +27,30 @@ from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 
 FILE_OPTION, VIEW_OPTION = "--rerun", "--view"
-REQUIREMENT = "rerun-sdk>=0.41,<0.42"
-"""As in the extra ``view``."""
+DISTRIBUTIONS, EXTRA, REQUIREMENT = ("rcnn-odom", "rcnn-odom-robot"), "view", "rerun-sdk>=0.41,<0.42"
+"""The distributions that hold this file, their extra that installs rerun, and what it requires."""
 ODOM, LASER, ROBOT = "odom", "odom/laser", "odom/base_link"
 PATH, MAP, ELLIPSE, MARKS = "odom/path", "odom/local_map", "odom/covariance", "marks"
-"""Places in the recording."""
+"""Entity paths of the recording."""
 SCAN_TIMELINE, STAMP_TIMELINE = "scan", "stamp"
-"""Timelines: the number of the scan, from 1, which is that of its line in steps.jsonl, and its seconds."""
+"""Timelines: the number of the scan from 1, which is also that of its line in steps.jsonl, and its stamp."""
 EPOCH = 1e8
-"""Seconds from which on stamps are dates; smaller ones count from some start."""
+"""Seconds; larger stamps are dates, smaller ones count from the start of some device."""
 DEVIATIONS = 3.0
-"""Standard deviations that the ellipse spans."""
+"""Half axes of the ellipse in standard deviations."""
 PORT = 9876
-"""Where the viewer listens: rerun's own."""
+"""TCP port of the viewer, rerun's default."""
 PATIENCE = 20.0
-"""Seconds that a viewer may take to start, or to take in the rest at the end."""
+"""Maximum number of seconds for a viewer to start, or to receive the remaining data at the end."""
 BATCH_ROWS, BATCH_BYTES, BATCH_SECONDS = 1000, 1 << 20, 5.0
-"""Of a file: it grows in steps of so much, as many small ones would be several times larger."""
+"""Size of the batches in a file; with many small batches it would be several times larger."""
 COLORS = {"scan": (255, 140, 0), PATH: (80, 160, 255), MAP: (150, 150, 150), ELLIPSE: (230, 60, 120)}
 
 
 class RerunLog(ABC):
-    """Scans, path, local map, ellipses of three standard deviations and marks, as they come.
+    """Logs scans, path, local map, ellipses of three standard deviations and remarks during the run.
 
-    Scans that are passed over, whose pose is the last one again, are told in the marks alone.
+    A scan that was passed over, whose pose is the last one again, only appears in the remarks.
 
     Raises:
         InputError: rerun is not installed.
@@ -60,27 +61,29 @@ class RerunLog(ABC):
         self._recording: Any = None
 
     def open(self, stream: ScanStream, odometer: Odometer) -> None:
-        """Gets to know a run that begins."""
+        """Prepares for a run that begins."""
         self._name, self._odometer = stream.name, odometer
         self._stamps, self._remarks = Stamps(odometer.tracker.period), Remarks()
-        self._maps, self._number, self._has_dates = LocalMaps(odometer), 0, False
-        self._place: tuple[float, float, float] | None = None
+        self._maps, self._number = LocalMaps(odometer), 0
+        self._has_dates: bool | None = None  # unknown until a scan has a stamp
+        self._last: tuple[float, float, float] | None = None
         self._has_ellipse = False
         self._body = ROBOT if odometer.laser_pose else LASER
         self._laser = f"{ROBOT}/laser" if odometer.laser_pose else LASER
 
     def add(self, pose: Pose, scan: Scan) -> None:
-        """One more pose, with its scan.
+        """Logs one more pose and its scan.
 
         Raises:
             InputError: the file cannot be written, or the viewer does not start.
         """
-        scan, seconds = with_bearings(scan, self._odometer), self._stamps.next(pose.stamp)
+        scan, seconds = add_bearings(scan, self._odometer), self._stamps.next(pose.stamp)
         points = scan.points() if scan.bearings is not None else np.empty((0, 2))
-        if self._recording is None:
+        if self._has_dates is None and self._stamps.is_recorded:
             self._has_dates = seconds > EPOCH
-            self._recording = self._begin()
-            self._log_statics()
+        if self._recording is None:
+            self._recording = self._start_recording()
+            self._log_static_data()
         self._number += 1
         self._set_time(seconds)
         for remark in self._remarks.add(pose.degraded):
@@ -89,12 +92,12 @@ class RerunLog(ABC):
         if is_passed_over(pose):
             return
         self._log_pose(pose)
-        self._log(f"{self._laser}/scan", self._rerun.Points3D(_flat(points)))
-        if (seen := self._maps.add()) is not None:
-            self._log(MAP, self._rerun.Points3D(_flat(seen)))
+        self._log(f"{self._laser}/scan", self._rerun.Points3D(_add_height(points)))
+        if (map_points := self._maps.add()) is not None:
+            self._log(MAP, self._rerun.Points3D(_add_height(map_points)))
 
     def finish(self, keep: bool) -> None:
-        """Waits until all of it has arrived.
+        """Waits until all data has arrived.
 
         Raises:
             OSError: a file can no longer be written.
@@ -107,11 +110,11 @@ class RerunLog(ABC):
         self._recording.flush(timeout_sec=PATIENCE)
 
     @abstractmethod
-    def _begin(self) -> Any:
-        """The recording, connected to where it goes to.
+    def _start_recording(self) -> Any:
+        """Opens a recording that is connected to a file or a viewer.
 
         Raises:
-            InputError: there is no way to there.
+            InputError: the file cannot be written, or the viewer does not start.
         """
 
     def _new_recording(self, **options: Any) -> Any:
@@ -119,18 +122,18 @@ class RerunLog(ABC):
         recording.set_log_time_enabled(False)
         return recording
 
-    def _log(self, place: str, what: Any, static: bool = False) -> None:
-        self._recording.log(place, what, static=static)
+    def _log(self, entity: str, data: Any, static: bool = False) -> None:
+        self._recording.log(entity, data, static=static)
 
     def _set_time(self, seconds: float) -> None:
         self._recording.set_time(SCAN_TIMELINE, sequence=self._number)
-        self._recording.set_time(
-            STAMP_TIMELINE, **{"timestamp" if self._has_dates else "duration": float(seconds)}
-        )
+        if self._has_dates is not None:
+            kind = "timestamp" if self._has_dates else "duration"
+            self._recording.set_time(STAMP_TIMELINE, **{kind: float(seconds)})
 
-    def _log_statics(self) -> None:
-        """What holds for the whole run: the axes, the colours, and where the laser sits on the robot."""
-        rerun, thin, thick = self._rerun, -1.5, -2.5  # negative: of the screen
+    def _log_static_data(self) -> None:
+        """Logs data for the whole run: axes, colours, and the pose of the laser on the robot."""
+        rerun, thin, thick = self._rerun, -1.5, -2.5  # negative radii are in units of the screen
         self._recording.send_recording_name(self._name.encode("utf-8", "replace").decode())
         self._log(ODOM, rerun.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         scan = rerun.Points3D.from_fields(colors=COLORS["scan"], radii=thick)
@@ -142,14 +145,14 @@ class RerunLog(ABC):
             self._log(self._laser, self._transform(*self._odometer.laser_pose), static=True)
 
     def _log_pose(self, pose: Pose) -> None:
-        """Where it is, how it came there from the place before, and how well that is known."""
-        place = (pose.x, pose.y, pose.heading)
-        self._log(self._body, self._transform(*place))
-        before = place if self._place is None else self._place
-        # A piece for every pose, of which the viewer shows all so far: the whole path each time would
-        # make the file grow with the square of its length.
-        self._log(PATH, self._rerun.LineStrips3D([_flat(np.array([before[:2], place[:2]]))]))
-        self._place = place
+        """Logs a pose, the piece of the path to it, and its ellipse."""
+        planar = (pose.x, pose.y, pose.heading)
+        self._log(self._body, self._transform(*planar))
+        before = planar if self._last is None else self._last
+        # One piece for each pose, and the viewer shows all pieces so far: with the whole path in each
+        # message, the file would grow with the square of the path's length.
+        self._log(PATH, self._rerun.LineStrips3D([_add_height(np.array([before[:2], planar[:2]]))]))
+        self._last = planar
         self._log_ellipse(pose)
 
     def _log_ellipse(self, pose: Pose) -> None:
@@ -172,23 +175,25 @@ class RerunLog(ABC):
         return self._rerun.Transform3D(translation=[x, y, 0.0], quaternion=_quaternion(self._rerun, heading))
 
     def _blueprint(self) -> Any:
-        """How the viewer shows it at first: it follows the laser, with the whole path so far; marks below."""
-        from rerun import blueprint as shown
+        """Initial layout of the viewer: it follows the laser, shows the path so far, and remarks below."""
+        from rerun import blueprint
 
-        so_far = shown.VisibleTimeRanges(
+        so_far = blueprint.VisibleTimeRanges(
             [
-                shown.VisibleTimeRange(
+                blueprint.VisibleTimeRange(
                     timeline,
-                    start=shown.TimeRangeBoundary.infinite(),
-                    end=shown.TimeRangeBoundary.cursor_relative(),
+                    start=blueprint.TimeRangeBoundary.infinite(),
+                    end=blueprint.TimeRangeBoundary.cursor_relative(),
                 )
                 for timeline in (SCAN_TIMELINE, STAMP_TIMELINE)
             ]
         )
-        follows = shown.EyeControls3D(tracking_entity=f"/{self._body}")
-        view = shown.Spatial3DView(origin=ODOM, name="map", overrides={PATH: so_far}, eye_controls=follows)
-        marks = shown.TextLogView(origin=MARKS, name="marks")
-        return shown.Blueprint(shown.Vertical(view, marks, row_shares=[4, 1]), collapse_panels=True)
+        follows = blueprint.EyeControls3D(tracking_entity=f"/{self._body}")
+        view = blueprint.Spatial3DView(
+            origin=ODOM, name="map", overrides={PATH: so_far}, eye_controls=follows
+        )
+        marks = blueprint.TextLogView(origin=MARKS, name="marks")
+        return blueprint.Blueprint(blueprint.Vertical(view, marks, row_shares=[4, 1]), collapse_panels=True)
 
 
 class RerunFile(RerunLog):
@@ -206,13 +211,13 @@ class RerunFile(RerunLog):
         super().__init__()
         self._file = OutputFile(path, FILE_OPTION, ".rrd")
 
-    def _begin(self) -> Any:
+    def _start_recording(self) -> Any:
         self._file.make_folder()
         batches = self._rerun.ChunkBatcherConfig(BATCH_SECONDS, BATCH_BYTES, BATCH_ROWS)
         recording = self._new_recording(batcher_config=batches)
         try:
             recording.save(self._file.path, default_blueprint=self._blueprint())
-        except Exception as error:  # of its own kinds
+        except Exception as error:  # rerun raises errors of several types
             self._file.remove()
             raise self._file.cannot_write(error) from error
         return recording
@@ -221,7 +226,7 @@ class RerunFile(RerunLog):
         """Completes the file, or removes it.
 
         Raises:
-            OSError: it can no longer be written.
+            OSError: the file can no longer be written.
         """
         super().finish(keep)
         if self._recording is not None and not keep:
@@ -235,7 +240,7 @@ class RerunFile(RerunLog):
 
 
 class RerunViewer(RerunLog):
-    """Rerun's viewer, opened when the first scan has come; it stays open after the run.
+    """Shows the run in rerun's viewer, which is opened at the first scan and stays open after the run.
 
     Raises:
         InputError: rerun is not installed, or there is no display.
@@ -252,10 +257,10 @@ class RerunViewer(RerunLog):
             )
 
     def _flush(self) -> None:
-        with suppress(RuntimeError):  # nobody looks any more
+        with suppress(RuntimeError):  # the viewer was closed
             super()._flush()
 
-    def _begin(self) -> Any:
+    def _start_recording(self) -> Any:
         recording = self._new_recording()
         try:
             self._rerun.spawn(
@@ -279,13 +284,21 @@ def _import_rerun() -> ModuleType:
     except ImportError as error:
         raise InputError(
             f"{FILE_OPTION} and {VIEW_OPTION} need rerun, which is not installed ({error}): pip install "
-            f"'{REQUIREMENT}'"
+            f"'{_find_distribution()}[{EXTRA}]', or pip install '{REQUIREMENT}'"
         ) from error
     return rerun
 
 
+def _find_distribution() -> str:
+    """The name of the installed distribution; if none is installed, that of the whole project."""
+    for name in DISTRIBUTIONS:
+        with suppress(PackageNotFoundError):
+            return distribution(name).metadata["Name"]
+    return DISTRIBUTIONS[0]
+
+
 def _find_viewer() -> str | None:
-    """The viewer that comes with the package, which is not on PATH where its environment is not active."""
+    """The viewer in rerun's package, which is not on PATH if the virtual environment is not active."""
     found = importlib.util.find_spec("rerun_cli")
     for folder in (found.submodule_search_locations or []) if found else []:
         for name in ("rerun", "rerun.exe"):
@@ -294,8 +307,8 @@ def _find_viewer() -> str | None:
     return None
 
 
-def _flat(points: Any) -> Any:
-    """Points (P, 2) at height 0, (P, 3)."""
+def _add_height(points: Any) -> Any:
+    """Points (P, 3) from points (P, 2), with z = 0."""
     return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
 
 

@@ -1,4 +1,4 @@
-"""Poses and scans as standard messages of ROS 2, made by ``rosbags``: no ROS is needed."""
+"""Poses and scans as standard messages of ROS 2, made with ``rosbags``: ROS itself is not needed."""
 
 import math
 from collections.abc import Iterable
@@ -17,37 +17,47 @@ LASER_SCAN, POINT_CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointClo
 LOG = "rcl_interfaces/msg/Log"
 """Types of messages."""
 AXES = (0, 1, 5)
-"""Of x, y and heading among the six of a covariance: x, y, z and the turns about them."""
-UNKNOWN = 1e6
-"""Variance of what is not known. It is large, since 0 would be certainty."""
+"""Rows of x, y and heading in a 6x6 covariance of ROS: x, y, z and the rotations about these axes."""
+UNKNOWN_VARIANCE = 1e6
+"""Variance of an unknown quantity. It is large, because 0 would mean that the quantity is exact."""
 WARNING, INFORMATION = 30, 20
 """Levels of rcl_interfaces/msg/Log."""
-EVEN = 0.01
-"""Part of the spacing of beams by which one may be off its place, and all still count as even."""
+EVEN_TOLERANCE = 0.01
+"""Beams count as even if each is off its place by less than this part of their spacing."""
 FLOAT32 = 7
-"""Of sensor_msgs/msg/PointField."""
+"""Constant of sensor_msgs/msg/PointField."""
 
 Planar = tuple[float, float, float]
 """x and y in metres and heading in radians."""
 
 
 def ros_covariance(covariance: FloatArray) -> FloatArray:
-    """The 36 values of a message, row by row, of a covariance (3, 3) of x, y and heading.
+    """The 36 values of a message, row by row, for a covariance (3, 3) of x, y and heading.
 
-    What is unknown (nan), and z, roll and pitch, which a planar laser does not measure, have a variance of
-    1e6 and no covariances. ROS lays no value down for it: -1, in the first place, is of sensor_msgs/Imu and
-    its like alone. robot_pose_ekf needs a large variance on dimensions that are not used, and drivers of
-    planar robots write one there; robot_localization leaves out what its configuration does.
+    Unknown quantities (nan), and z, roll and pitch, which a planar laser does not measure, get a variance of
+    1e6 and zero covariances. ROS defines no value for an unknown one: -1 in the first place is defined only
+    for sensor_msgs/Imu and similar messages. robot_pose_ekf needs a large variance on dimensions that are not
+    used, and drivers of planar robots write one there; robot_localization ignores the dimensions that its
+    configuration leaves out.
+
+    Example:
+        >>> ros_covariance(np.diag([0.04, 0.01, np.nan])).reshape(6, 6).diagonal().tolist()
+        [0.04, 0.01, 1000000.0, 1000000.0, 1000000.0, 1000000.0]
     """
     known = np.isfinite(np.diag(covariance))
     planar = np.where(np.outer(known, known) & np.isfinite(covariance), covariance, 0.0)
-    values = UNKNOWN * np.eye(6)
-    values[np.ix_(AXES, AXES)] = planar + np.diag(np.where(known, 0.0, UNKNOWN))
+    values = UNKNOWN_VARIANCE * np.eye(6)
+    values[np.ix_(AXES, AXES)] = planar + np.diag(np.where(known, 0.0, UNKNOWN_VARIANCE))
     return values.ravel()
 
 
 def has_even_beams(scan: Scan) -> bool:
-    """Whether a LaserScan message can say where the beams lie: one after the other at the same distance."""
+    """Whether a LaserScan message can describe the beams: in order and with one spacing.
+
+    Example:
+        >>> has_even_beams(Scan(np.ones(3), np.array([0.0, 0.1, 0.2])))
+        True
+    """
     if scan.bearings is None or not scan.has_all_beams:
         return False
     if len(scan.bearings) < 2:
@@ -57,34 +67,35 @@ def has_even_beams(scan: Scan) -> bool:
     angles = np.unwrap(scan.bearings)
     spacing = (angles[-1] - angles[0]) / (len(angles) - 1)
     off = np.abs(angles - angles[0] - spacing * np.arange(len(angles))).max()
-    return bool(off < EVEN * abs(spacing))
+    return bool(off < EVEN_TOLERANCE * abs(spacing))
 
 
 @cache
 def typestore() -> Any:
-    """The types of ROS 2 Humble, which for these messages are those of later versions as well."""
+    """The message types of ROS 2 Humble; those used here are the same in later versions."""
     from rosbags.typesys import Stores, get_typestore
 
     return get_typestore(Stores.ROS2_HUMBLE)
 
 
 def serialize(message: Any, kind: str) -> bytes:
-    """A message of such a type as bytes."""
+    """The bytes (CDR) of a message of the type ``kind``."""
     return bytes(typestore().serialize_cdr(message, kind))
 
 
 def velocity_of(step: Step, seconds: float) -> tuple[Planar, FloatArray]:
-    """Velocity in metres and radians a second, in the frame in mid-turn, and its covariance (3, 3).
+    """Velocity in metres and radians per second, in the frame at mid-turn, and its covariance (3, 3).
 
     Args:
         step: to the present pose.
-        seconds: that it took; not positive: the velocity is unknown, and 0.
+        seconds: duration of the step. If it is not positive, or nan, the velocity is unknown: it is 0 and its
+            covariance nan.
 
     Example:
         >>> velocity_of(Step(0.2, 0.0, 0.0), 0.1)[0]
         (2.0, 0.0, 0.0)
     """
-    if seconds <= 0:
+    if not seconds > 0:
         return (0.0, 0.0, 0.0), unknown_covariance()
     middle = turn_to_middle(step)
     x, y, turn = (middle.array() / seconds).tolist()
@@ -96,11 +107,12 @@ def odometry(nanoseconds: int, frame: str, child: str, pose: Pose, seconds: floa
 
     Args:
         nanoseconds: of its stamp.
-        frame, child: names of the fixed frame and of what moves.
+        frame, child: names of the fixed frame and of the moving one.
         pose: of the odometer.
-        seconds: since the pose before; not positive: the velocity is unknown, and 0 in the message.
+        seconds: since the last pose. If it is not positive, or nan, the velocity is unknown: in the message
+            it is 0, with variances of 1e6 (:func:`ros_covariance`).
     """
-    (x, y, turn), of_velocity = velocity_of(pose.step, seconds)
+    (x, y, turn), velocity_covariance = velocity_of(pose.step, seconds)
     twist = _geometry("Twist", _vector(x, y), _geometry("Vector3", 0.0, 0.0, turn))
     return typestore().types[ODOMETRY](
         header=_header(nanoseconds, frame),
@@ -108,7 +120,7 @@ def odometry(nanoseconds: int, frame: str, child: str, pose: Pose, seconds: floa
         pose=_geometry(
             "PoseWithCovariance", _pose((pose.x, pose.y, pose.heading)), ros_covariance(pose.covariance)
         ),
-        twist=_geometry("TwistWithCovariance", twist, ros_covariance(of_velocity)),
+        twist=_geometry("TwistWithCovariance", twist, ros_covariance(velocity_covariance)),
     )
 
 
@@ -118,25 +130,25 @@ def path(nanoseconds: int, frame: str, poses: Iterable[tuple[int, Planar]]) -> A
     return typestore().types[PATH](header=_header(nanoseconds, frame), poses=stamped)
 
 
-def transforms(nanoseconds: int, frame: str, child: str, place: Planar) -> Any:
-    """Where ``child`` is in ``frame``, as /tf and /tf_static have it."""
-    x, y, heading = place
-    moved = _geometry("Transform", _vector(x, y), _quaternion(heading))
-    stamped = _geometry("TransformStamped", _header(nanoseconds, frame), child, moved)
+def transforms(nanoseconds: int, frame: str, child: str, pose: Planar) -> Any:
+    """The pose of ``child`` in ``frame``, as a message for /tf and /tf_static."""
+    x, y, heading = pose
+    transform = _geometry("Transform", _vector(x, y), _quaternion(heading))
+    stamped = _geometry("TransformStamped", _header(nanoseconds, frame), child, transform)
     return typestore().types[TRANSFORMS](transforms=[stamped])
 
 
 def laser_scan(nanoseconds: int, frame: str, scan: Scan) -> Any:
-    """A scan with even beams, as its laser gave it.
+    """A scan with even beams, as the laser gave it.
 
-    What is no return is nan, or inf where it lies beyond the laser's reach (REP 117).
-    How far the laser reaches is unknown of a scan: ``range_max`` is inf, and ``range_min`` 0.
+    A beam without a return is nan, or inf if the target is beyond the laser's range (REP 117).
+    A scan does not say how far its laser reaches: ``range_max`` is inf, and ``range_min`` 0.
     """
     assert scan.bearings is not None, "its beams are even"
     count = len(scan.ranges)
     angles = np.unwrap(scan.bearings) if count else np.zeros(1)
     extent = float(angles[-1] - angles[0])
-    with np.errstate(over="ignore"):  # of readings that no laser gives
+    with np.errstate(over="ignore"):  # ranges too large for float32, which no real laser gives
         ranges = np.where(scan.ranges > 0, scan.ranges, np.nan).astype(np.float32)
     return typestore().types[LASER_SCAN](
         header=_header(nanoseconds, frame),
@@ -172,18 +184,19 @@ def point_cloud(nanoseconds: int, frame: str, points: npt.ArrayLike) -> Any:
 
 
 def log(nanoseconds: int, level: int, text: str) -> Any:
-    """Words of this program."""
+    """A log message of this program."""
     return typestore().types[LOG](
         stamp=_time(nanoseconds), level=level, name="rcnn_odom", msg=text, file="", function="", line=0
     )
 
 
 def _time_increment(scan: Scan) -> float:
-    """Seconds from beam to beam; 0 where unknown, or where they are no such."""
+    """Seconds between neighbouring beams; 0 if they are unknown, not positive or not even."""
     if scan.times is None or len(scan.times) < 2:
         return 0.0
     step = float(scan.times[1] - scan.times[0])
-    is_even = np.allclose(scan.times, step * np.arange(len(scan.times)), rtol=0.0, atol=EVEN * abs(step))
+    even = step * np.arange(len(scan.times))
+    is_even = np.allclose(scan.times, even, rtol=0.0, atol=EVEN_TOLERANCE * abs(step))
     return step if step > 0 and is_even else 0.0
 
 
@@ -207,6 +220,6 @@ def _quaternion(heading: float) -> Any:
     return _geometry("Quaternion", 0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2))
 
 
-def _pose(place: Planar) -> Any:
-    x, y, heading = place
+def _pose(pose: Planar) -> Any:
+    x, y, heading = pose
     return _geometry("Pose", _geometry("Point", x, y, 0.0), _quaternion(heading))

@@ -1,6 +1,7 @@
-"""A model over a recording or a live laser: ``rcnn-odom run``."""
+"""Runs a model on a recording or a live laser: ``rcnn-odom run``."""
 
 import json
+import logging
 import math
 import time
 from collections import Counter
@@ -16,11 +17,13 @@ from tqdm import tqdm
 from tqdm.contrib.logging import logging_redirect_tqdm
 
 from rcnn_odom import __version__
+from rcnn_odom.deployment.laser_view import LaserViewCheck
 from rcnn_odom.deployment.odometer import Odometer, Pose
-from rcnn_odom.deployment.output import Output, thinned
+from rcnn_odom.deployment.output import Output, thin_points
 from rcnn_odom.deployment.report_page import write_page
-from rcnn_odom.deployment.report_pictures import Seen
+from rcnn_odom.deployment.report_pictures import MapScan
 from rcnn_odom.deployment.sampling import EvenSample
+from rcnn_odom.deployment.three_lines import format_lines
 from rcnn_odom.deployment.timeline import Timeline, causes_in
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame
@@ -31,13 +34,16 @@ from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.stream import ScanStream
 from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
+log = logging.getLogger(__name__)
+
 TRAJECTORY, TUM, STEPS = "trajectory.txt", "trajectory.tum", "steps.jsonl"
 PAGE, SUMMARY = "report.html", "summary.json"
 MAP_SCANS, MAP_POINTS = 2000, 2000
-"""Scans that a map is drawn of, and points of each: 32 MB at most."""
+"""Maximum number of scans in the map, and of points of each: at most 32 MB."""
 LATENCIES = 100_000
+"""Maximum number of computing times that are kept for the percentiles."""
 FEW_SCANS = 6
-"""Fewer than so many need not have two that can be compared."""
+"""A run with at least this many scans must have two that can be compared."""
 ANOTHER_MODEL = (
     "take --model matcher, which fits any laser, or train a model on recordings of such a laser (rcnn-odom "
     "train data=... {})"
@@ -56,30 +62,48 @@ def run(
     settings: Mapping[str, str] | None = None,
     outputs: Sequence[Output] = (),
 ) -> Summary:
-    """Poses for all scans of a stream.
+    """Computes the poses of all scans of a stream and writes them.
 
-    What is written is valid at every moment, and complete up to the scan where a stream breaks off or
-    the run is stopped. Where no scan can be used nothing is left behind.
+    The files are valid at any time. If the stream or the run is interrupted, they are complete up to that
+    scan, and after Ctrl-C the three lines of :func:`rcnn_odom.deployment.three_lines.format_lines` are
+    logged. If no scan can be used, all files are removed.
 
     Args:
         odometer: at its start.
         stream: the scans.
-        model: what to call it.
+        model: name of the model for report and summary.
         out: folder for trajectories, steps, report and summary; it must not hold a trajectory yet.
-        on_pose: gets every pose as soon as it is known.
-        settings: what else the user set, by name, in words for the report.
-        outputs: what else takes the poses and their scans, such as files for viewers.
+        on_pose: called with each pose as soon as it is computed.
+        settings: options that the user chose, by name, for the report.
+        outputs: other outputs for poses and scans, such as files for viewers.
 
     Returns:
-        What ``summary.json`` holds: counts, path, marked stretches, and the time of a scan.
+        The content of ``summary.json``: counts, path, marked stretches, computing times.
 
     Raises:
-        InputError: the folder holds a trajectory or cannot be written, the laser is another than the
-            model's, the stream has no scan, none that can be used, no two that can be compared, or
-            breaks off.
+        InputError: the folder holds a trajectory or cannot be written, the laser is not one for the network,
+            or the stream has no scan, no usable scan, no two scans that can be compared, or breaks off.
     """
     statistics = Statistics(stream, model, odometer)
-    # Of a robot no camera is known; its trajectory is told as of one that looks ahead.
+    try:
+        _estimate_poses(statistics, out, on_pose, settings or {}, outputs)
+    except KeyboardInterrupt:
+        if statistics.can_use:
+            log.info("%s", format_lines(statistics.summary(), out / PAGE if out else None))
+        raise
+    return statistics.summary()
+
+
+def _estimate_poses(
+    statistics: "Statistics",
+    out: Path | None,
+    on_pose: Callable[[Pose], object] | None,
+    settings: Mapping[str, str],
+    outputs: Sequence[Output],
+) -> None:
+    """Computes the poses of all scans and passes them to the folder and the outputs; see :func:`run`."""
+    stream, odometer = statistics.stream, statistics.odometer
+    # The pose of a camera on the robot is unknown; trajectory files assume one that looks ahead.
     camera = FORWARD_CAMERA if odometer.laser_pose else stream.camera_from_laser
     with ExitStack() as stack:
         folder = OutputFolder(out, stream, camera, stack) if out else None
@@ -87,9 +111,9 @@ def run(
             output.open(stream, odometer)
             stack.callback(_finish, output, statistics)
         try:
-            # Of a live laser the poses are what is printed.
+            # There is no progress bar for a live laser, whose poses are printed.
             for scan in stack.enter_context(_show_progress(stream, bool(out or outputs) and not on_pose)):
-                if statistics.passes_over(scan):
+                if statistics.lacks_bearings(scan):
                     continue
                 pose = statistics.step(scan)
                 if folder:
@@ -105,8 +129,7 @@ def run(
             raise
         finally:
             if folder:
-                folder.finish(statistics, settings or {})
-    return statistics.summary()
+                folder.finish(statistics, settings)
 
 
 def _finish(output: Output, statistics: "Statistics") -> None:
@@ -115,7 +138,7 @@ def _finish(output: Output, statistics: "Statistics") -> None:
 
 @contextmanager
 def _show_progress(stream: ScanStream, is_wanted: bool) -> Iterator["tqdm[Scan]"]:
-    """The scans, with a bar if standard error is a terminal; what is logged meanwhile stands above it."""
+    """Shows a progress bar if standard error is a terminal; log messages are printed above it."""
     bar = tqdm(stream.scans, stream.name, stream.total, unit="scan", disable=None if is_wanted else True)
     with closing(bar), ExitStack() as stack:
         if not bar.disable:
@@ -124,20 +147,21 @@ def _show_progress(stream: ScanStream, is_wanted: bool) -> Iterator["tqdm[Scan]"
 
 
 class Statistics:
-    """What is counted and sampled along a run, in constant memory.
+    """Counts and samples what happens in a run, in constant memory.
 
     Args:
         stream: the scans.
-        model: what to call it.
+        model: name of the model.
         odometer: at its start.
 
     Attributes:
-        can_use: there was a scan that fits the model and has returns.
-        timeline: what the report shows over time.
-        laser: what the scan with the most beams tells of it, in words.
+        can_use: whether a scan so far fitted the model and had returns.
+        timeline: values over time for the report.
+        laser: description of the laser, from the scan with the most beams.
+        notes: messages of the reader of the recording, and a warning about the laser.
 
     Raises:
-        InputError: the stream's laser is another than a network's.
+        InputError: the laser of the stream is not one for the network.
     """
 
     def __init__(self, stream: ScanStream, model: str, odometer: Odometer) -> None:
@@ -145,19 +169,21 @@ class Statistics:
         self.scans, self.path, self.longest, self.stopped = 0, 0.0, 0.0, ""
         self.can_use, sensor = False, odometer.sensor
         self._absent = AbsentReturns(sensor.max_range if sensor else math.inf)
-        if sensor and stream.beams and (reason := compare_beams(stream.beams, sensor)):
+        partly = odometer.beam_check is not None and odometer.beam_check.partly
+        if sensor and stream.beams and (reason := compare_beams(stream.beams, sensor, partly)):
             advice = ANOTHER_MODEL.format(stream.beams.sensor_options() or "data.sensor...")
             raise InputError(f"{stream.name}: {reason}; {advice}")
         self.degraded: Counter[str] = Counter()
         self.milliseconds = EvenSample[float](LATENCIES)
-        self.sample = EvenSample[Seen](MAP_SCANS)
+        self.sample = EvenSample[MapScan](MAP_SCANS)
         self.timeline, self.laser, self._beams = Timeline(), "", 0
+        self.notes, self._view = list(stream.notes), LaserViewCheck(odometer, model, stream.beams)
 
-    def passes_over(self, scan: Scan) -> bool:
-        """Whether nothing says where the beams of a scan lie, among others where something does; counts it.
+    def lacks_bearings(self, scan: Scan) -> bool:
+        """Whether the bearings of a scan are unknown, so that it must be skipped; counts such scans.
 
         Raises:
-            InputError: nothing says it of the first one.
+            InputError: those of the first scan are unknown.
         """
         if scan.bearings is not None or self.odometer.sensor:
             return False
@@ -167,10 +193,10 @@ class Statistics:
         return True
 
     def step(self, scan: Scan) -> Pose:
-        """One scan through the odometer, timed and counted.
+        """Computes the pose of one scan, and measures the time of that.
 
         Raises:
-            InputError: the laser is another than a network's, for good.
+            InputError: several scans in a row show that the laser is not one for the network.
         """
         odometer, check = self.odometer, self.odometer.beam_check
         start = time.perf_counter()
@@ -179,6 +205,9 @@ class Statistics:
         self.scans += 1
         if check and check.is_for_good:
             raise check.refusal(f"{self.stream.name}: scan {self.scans}", ANOTHER_MODEL)
+        if warning := self._view.add(scan):
+            log.warning("%s: %s", self.stream.name, warning)
+            self.notes.append(warning)
         self.can_use = self.can_use or odometer.has_seen
         if not self.can_use:
             self._absent.add(scan)
@@ -188,23 +217,22 @@ class Statistics:
         self.degraded.update(causes_in(pose.degraded))
         if len(scan.ranges) > self._beams:
             self._beams, self.laser = len(scan.ranges), describe_laser(scan, self.stream)
-        # A scan that was passed over keeps the stamp of the pose that it repeats.
+        # With a clock, the pose has its stamp already; a scan that was passed over has that of the last pose.
         pose = pose if self.stream.has_clock else replace(pose, stamp=scan.stamp)
-        self._look(pose)
+        self._sample_for_report(pose)
         return pose
 
-    def _look(self, pose: Pose) -> None:
-        """Keeps what the report shows of a pose."""
+    def _sample_for_report(self, pose: Pose) -> None:
         self.timeline.add(pose)
         scan, seconds = self.scans, self.timeline.seconds or 0.0
-        place, returns = (pose.x, pose.y, pose.heading), self.odometer.returns
-        self.sample.add(lambda: Seen(place, thinned(returns(), MAP_POINTS), scan, seconds))
+        planar, returns = (pose.x, pose.y, pose.heading), self.odometer.returns
+        self.sample.add(lambda: MapScan(planar, thin_points(returns(), MAP_POINTS), scan, seconds))
 
     def require_usable_scans(self) -> None:
-        """Looks at the end whether anything could be used.
+        """Checks at the end that scans could be used and compared.
 
         Raises:
-            InputError: nothing could; the message says why.
+            InputError: they could not; the message says why.
         """
         name, advice = self.stream.name, "give another recording, or correct what its laser writes"
         if self.can_use and (self.odometer.estimates or self.scans < FEW_SCANS):
@@ -219,7 +247,7 @@ class Statistics:
         raise InputError(f"{name}: {self._absent}; {advice}")
 
     def summary(self) -> Summary:
-        """Plain values."""
+        """The content of ``summary.json``."""
         median, p99 = np.percentile(self.milliseconds.items, [50, 99]).tolist()
         end = self.timeline.end
         return {
@@ -228,7 +256,7 @@ class Statistics:
             "laser_pose": self.odometer.laser_pose,
             "scans": self.scans,
             "path_m": self.path,
-            "notes": list(self.stream.notes),
+            "notes": list(self.notes),
             "degraded": dict(self.degraded),
             "skipped": dict(self.stream.skipped),
             "latency": {"median_ms": median, "p99_ms": p99, "max_ms": self.longest},
@@ -240,15 +268,19 @@ class Statistics:
         }
 
     def _speed(self) -> dict[str, float] | None:
-        """Metres per second of the way, if the recording tells the time."""
+        """Mean and largest speed in metres per second; None if the time is unknown."""
         if not self.timeline.seconds:
             return None
         mean = self.path / self.timeline.seconds
         return {"mean_m_s": mean, "top_m_s": max(mean, self.timeline.top_speed)}
 
     def settings(self, given: Mapping[str, str]) -> dict[str, str]:
-        """What is known of the run, by name, in words, and what the user set."""
-        told = {
+        """Properties of the run, by name, as text for the report.
+
+        Args:
+            given: options that the user chose, by name.
+        """
+        settings = {
             "recording": self.stream.name,
             "model": self.model,
             "laser": self.laser,
@@ -256,20 +288,27 @@ class Statistics:
         }
         if self.odometer.laser_pose:
             x, y, heading = self.odometer.laser_pose
-            told["poses"] = (
+            settings["poses"] = (
                 f"of the robot, with its laser {x:g} m ahead, {y:g} m to the left, turned by "
                 f"{math.degrees(heading):.4g} degrees"
             )
         if self.timeline.seconds and self.scans > 1:
-            told["time between scans"] = f"{1e3 * self.timeline.seconds / (self.scans - 1):.3g} ms on average"
-        if self.stream.notes:
-            told["noticed"] = "; ".join(self.stream.notes)
+            settings["time between scans"] = (
+                f"{1e3 * self.timeline.seconds / (self.scans - 1):.3g} ms on average"
+            )
+        if self.notes:
+            settings["notes"] = "; ".join(self.notes)
         now = datetime.now().strftime("%Y-%m-%d %H:%M")
-        return {**told, **given, "rcnn-odom": __version__, "date of this run": now}
+        return {**settings, **given, "rcnn-odom": __version__, "date of this run": now}
 
 
 def describe_laser(scan: Scan, stream: ScanStream) -> str:
-    """What a scan and its recording tell of the laser, in words."""
+    """Describes the laser in words, from a scan and its recording.
+
+    >>> scan = Scan(np.full(181, 5.0), np.deg2rad(np.arange(-90.0, 91.0)), frame_id="laser")
+    >>> describe_laser(scan, ScanStream("room.bag", iter([scan])))
+    '181 beams from -90 to 90 degrees, one every 1, frame laser'
+    """
     frame = f", frame {scan.frame_id}" if scan.frame_id else ""
     if stream.beams:
         return f"beams {stream.beams}{frame}"
@@ -282,13 +321,14 @@ def describe_laser(scan: Scan, stream: ScanStream) -> str:
 
 
 class OutputFolder:
-    """The files of a run, begun with the first pose, each line written as soon as it is known.
+    """The files of a run. They are created at the first pose, and each line is written immediately.
 
     Args:
-        folder: to write to, made where missing.
+        folder: where the files are written; it is created if it does not exist.
         stream: the scans, for their name.
-        camera: (4, 4) from the body whose poses are given, the frame in which trajectories are written.
-        stack: closes the files of lines.
+        camera: (4, 4) transform from the laser's, or the robot's, frame to that of the camera, in which
+            trajectories are written.
+        stack: closes the files that are written line by line.
 
     Raises:
         InputError: the folder holds such files already.
@@ -297,15 +337,15 @@ class OutputFolder:
     def __init__(self, folder: Path, stream: ScanStream, camera: FloatArray, stack: ExitStack) -> None:
         self.folder, self.stream, self.camera = folder, stream, camera
         self._stack, self._written = stack, 0
-        self._made = [each for each in (folder, *folder.parents) if not each.exists()]
+        self._new_folders = [each for each in (folder, *folder.parents) if not each.exists()]
         if found := [name for name in (TRAJECTORY, TUM, STEPS, PAGE, SUMMARY) if (folder / name).exists()]:
             what = "a trajectory" if found[0] == TRAJECTORY else found[0]
             raise InputError(f"{folder}: holds {what} already; choose another --out")
 
-    def _begin(self) -> None:
+    def _open_files(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
-            # Line by line, so that a run that is killed leaves no half of one.
+            # Buffered by line, so that a run that is killed leaves only complete lines.
             self._kitti, self._tum, self._steps = (
                 self._stack.enter_context((self.folder / name).open("w", buffering=1, encoding="utf-8"))
                 for name in (TRAJECTORY, TUM, STEPS)
@@ -316,13 +356,16 @@ class OutputFolder:
             ) from error
 
     def add(self, pose: Pose) -> None:
-        """One more pose; without a stamp it stands under its number, one that is told again under no time.
+        """Writes one more pose.
+
+        In the TUM file, a pose without a stamp has its number in place of one, and a pose that is repeated
+        because its scan was passed over is left out.
 
         Raises:
             InputError: the folder cannot be written.
         """
         if not self._written:
-            self._begin()
+            self._open_files()
         camera_pose = change_frame(pose.matrix()[None], self.camera)
         write_kitti(self._kitti, camera_pose)
         if not pose.degraded.startswith(PASSED_OVER):
@@ -331,7 +374,7 @@ class OutputFolder:
         self._written += 1
 
     def finish(self, statistics: Statistics, settings: Mapping[str, str]) -> None:
-        """The report and the summary, where there is a pose; nothing at all where no scan could be used."""
+        """Writes report and summary; if no scan could be used, removes all files."""
         if not self._written:
             return
         if not statistics.can_use:
@@ -339,12 +382,12 @@ class OutputFolder:
             return
         summary = statistics.summary()
         (self.folder / SUMMARY).write_text(json.dumps(summary, indent=2) + "\n", encoding="utf-8")
-        told = statistics.settings(settings)
-        write_page(self.folder / PAGE, summary, statistics.timeline, statistics.sample.items, told)
+        all_settings = statistics.settings(settings)
+        write_page(self.folder / PAGE, summary, statistics.timeline, statistics.sample.items, all_settings)
 
     def _remove(self) -> None:
         for name in (TRAJECTORY, TUM, STEPS):
             (self.folder / name).unlink(missing_ok=True)
-        for folder in self._made:
-            with suppress(OSError):  # somebody else has put something there
+        for folder in self._new_folders:
+            with suppress(OSError):  # the folder holds other files by now
                 folder.rmdir()

@@ -1,4 +1,4 @@
-"""A sample of a stream without end, in constant memory."""
+"""A sample of an endless stream in constant memory."""
 
 from collections.abc import Callable
 from typing import Generic, TypeVar
@@ -7,13 +7,20 @@ Item = TypeVar("Item")
 
 
 class EvenSample(Generic[Item]):
-    """Every item of a stream, then every second, every fourth ...: evenly spaced, never more than fit.
+    """Keeps every item of a stream, then every second, then every fourth, and so on: an even sample.
 
     Args:
-        capacity: most items that are kept; even.
+        capacity: maximum number of items; even.
 
     Attributes:
-        items: those that are kept, in order.
+        items: the items that are kept, in order.
+
+    Example:
+        >>> sample = EvenSample(4)
+        >>> for number in range(10):
+        ...     sample.add(lambda: number)
+        >>> sample.items
+        [0, 4, 8]
     """
 
     def __init__(self, capacity: int) -> None:
@@ -21,12 +28,12 @@ class EvenSample(Generic[Item]):
         self._every, self._seen = 1, 0
 
     def add(self, make: Callable[[], Item]) -> None:
-        """One more item of the stream, which is made only if it is kept."""
+        """Adds one item of the stream; ``make`` is called only if the item is kept."""
         if self._seen % self._every == 0:
             if len(self.items) == self.capacity:
                 self.items = self.items[::2]
                 self._every *= 2
-            # Doubled just now, this item may no longer be one of those that are kept.
+            # The interval may just have doubled, and then this item may no longer be kept.
             if self._seen % self._every == 0:
                 self.items.append(make())
         self._seen += 1

@@ -9,24 +9,28 @@ from typing import Any
 from rcnn_odom.geometry import wrap_angle
 
 CAUSES_NAMED, STRETCHES_NAMED = 3, 2
-"""So many are named in a line; of others only that there are more."""
+"""Maximum number of causes in the line, and of stretches for each; it only says whether there are more."""
 
 
 def three_lines(summary: Mapping[str, Any]) -> dict[str, str]:
-    """What a run comes to, by the name of the line: path, speed and trouble.
+    """Describes a run in three lines, by the name of the line: path, speed and trouble.
 
     Args:
-        summary: of :func:`rcnn_odom.deployment.run.run`.
+        summary: as :func:`rcnn_odom.deployment.run.run` returns it.
     """
-    return {"path": _path(summary), "speed": _speed(summary), "trouble": _trouble(summary)}
+    return {
+        "path": _describe_path(summary),
+        "speed": _describe_speed(summary),
+        "trouble": _describe_trouble(summary),
+    }
 
 
 def format_lines(summary: Mapping[str, Any], page: Path | None = None) -> str:
-    """The three lines for a terminal.
+    """Formats the three lines for a terminal.
 
     Args:
         summary: of the run.
-        page: where there is more to see.
+        page: the report of the run, to be named in the last line; None if there is none.
     """
     lines = three_lines(summary)
     if page:
@@ -34,45 +38,45 @@ def format_lines(summary: Mapping[str, Any], page: Path | None = None) -> str:
     return "\n".join(f"{name:<9}{line}" for name, line in lines.items())
 
 
-def _path(summary: Mapping[str, Any]) -> str:
-    end, whose = summary["end"], " by the robot" if summary["laser_pose"] else ""
+def _describe_path(summary: Mapping[str, Any]) -> str:
+    end, driver = summary["end"], " by the robot" if summary["laser_pose"] else ""
     x, y = end["x"], end["y"]
     turn = round(math.degrees(float(wrap_angle(end["heading"]))))
     degrees = "degree" if abs(turn) == 1 else "degrees"
     turned = f"turned {abs(turn)} {degrees} {'left' if turn > 0 else 'right'}" if turn else "not turned"
     return (
-        f"{summary['scans']} scans, {summary['path_m']:.1f} m driven{whose}; ended "
+        f"{summary['scans']} scans, {summary['path_m']:.1f} m driven{driver}; ended "
         f"{math.hypot(x, y):.1f} m from the start ({abs(x):.1f} m {'ahead' if x >= 0 else 'behind'}, "
         f"{abs(y):.1f} m {'left' if y >= 0 else 'right'}), {turned}"
     )
 
 
-def _speed(summary: Mapping[str, Any]) -> str:
+def _describe_speed(summary: Mapping[str, Any]) -> str:
     times, speed = summary["latency"], summary["speed"]
-    computed = f"{_round(times['median_ms'])} ms a scan"
+    computed = f"{_format_number(times['median_ms'])} ms a scan"
     if not speed:
-        why = "have no time stamps" if summary["recording_s"] is None else "are of one moment"
-        return f"{computed}; the scans {why}, so that no speed is known"
-    share = 1e3 * summary["recording_s"] / (times["median_ms"] * summary["scans"])
+        why = "have no time stamps" if summary["recording_s"] is None else "all have the same time stamp"
+        return f"{computed}; the scans {why}, so the speed is unknown"
+    ratio = 1e3 * summary["recording_s"] / (times["median_ms"] * summary["scans"])
     return (
-        f"{computed}, {_round(share)} times as fast as the recording (reading it aside); the robot "
+        f"{computed}, {_format_number(ratio)} times as fast as the recording (without reading it); the robot "
         f"drove {speed['mean_m_s']:.2f} m/s on average, {speed['top_m_s']:.2f} m/s at most"
     )
 
 
-def _round(value: float) -> str:
-    """Two digits that count, never as 1e+02."""
+def _format_number(value: float) -> str:
+    """Rounds to two significant digits, without an exponent such as 1e+02."""
     return f"{float(f'{value:.2g}'):g}"
 
 
-def _trouble(summary: Mapping[str, Any]) -> str:
+def _describe_trouble(summary: Mapping[str, Any]) -> str:
     marked = summary["marked"]
     parts = [
         f"{cause}: {_count_scans(sum(one['scans'] for one in stretches))}, {name_stretches(stretches)}"
         for cause, stretches in list(marked.items())[:CAUSES_NAMED]
     ]
     if len(marked) > CAUSES_NAMED:
-        parts.append(f"{len(marked) - CAUSES_NAMED} more kinds")
+        parts.append(f"{len(marked) - CAUSES_NAMED} more causes")
     if summary["skipped"]:
         skipped = ", ".join(f"{count} {kind}" for kind, count in summary["skipped"].items())
         parts.append(f"skipped: {skipped}")
@@ -86,7 +90,7 @@ def _count_scans(count: int) -> str:
 
 
 def name_stretches(stretches: Sequence[Mapping[str, Any]], most: int = STRETCHES_NAMED) -> str:
-    """Where the first of them lie.
+    """Says where the first stretches lie, at most ``most`` of them.
 
     >>> name_stretches([{"from_s": 31.2, "to_s": 32.4}, {"from_s": 40.0, "to_s": 40.0}])
     'from 31.2 s to 32.4 s, at 40.0 s'

@@ -1,4 +1,4 @@
-"""A network's step as the prior of the matcher's match: each where the other knows little."""
+"""Scan matching with a network's steps as priors: the network adds what the scans do not determine."""
 
 from dataclasses import dataclass
 from typing import ClassVar
@@ -13,59 +13,67 @@ from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.pairs import PairTracker
 from rcnn_odom.models.prior import LastMotion, Prior, PriorSource
 from rcnn_odom.models.shipped_files import find_file
-from rcnn_odom.models.streaming import Stepper
+from rcnn_odom.models.streaming import Description, Stepper
 from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive, wants_deskew
 from rcnn_odom.recordings.scan import Scan
 
 HELD = "held"
-"""In place of a network: the matcher's own last motion, which pulls by its covariance."""
+"""Option that uses the matcher's last motion, weighted by its covariance, in place of a network."""
 INFLATION = 2.0
-"""Times a network's deviations: they were fitted on places like those of its training, and its errors of
-scans in a row are alike."""
+"""Factor of a network's standard deviations.
+
+They were fitted on places like those of the training, and the errors of consecutive scans are correlated.
+"""
 LEAST_DISTANCE, LEAST_TURN = 0.01, 0.002
-"""Metres and radians by which a network is off at least, beside what it says."""
-COMPARED = 50.0
-"""Matches over which the network's errors are averaged, while they need no prior."""
-STANDS = "the network tells it"
+"""Metres and radians; minimal errors of a network, which are added to its own standard deviations."""
+AVERAGED_MATCHES = 50.0
+"""Number of recent matches over which the network's errors are averaged."""
+NETWORK_STEP = "the network's step is used"
+"""What happens where the scan does not determine the motion; notes on the scan contain this."""
 NO_PRIOR = "no prior"
-"""Kind of trouble."""
+"""Kind of fault, with which the note begins."""
 
 
 @dataclass(frozen=True)
 class FusedOptions:
-    """What ``conf/model/fused.yaml`` sets.
+    """The options of ``conf/model/fused.yaml``.
 
     Attributes:
-        network: a network that ships with the project, a file of ``rcnn-odom export``, or ``held``.
+        network: name of a network that ships with the project, path of a file that ``rcnn-odom export`` has
+            written, or ``held`` for the matcher's last motion.
+
+    Example:
+        >>> FusedOptions()
+        FusedOptions(network='all_round')
     """
 
     network: str = option(
         default="all_round",
         fits=lambda network: bool(network.strip()),
-        wanted="a network that ships along, a file of rcnn-odom export, or held",
+        wanted="the name of a shipped network, a file that rcnn-odom export has written, or held",
     )
 
 
 class NetworkPrior:
-    """The steps of a network of pairs of scans as a :class:`rcnn_odom.models.prior.PriorSource`.
+    """A :class:`rcnn_odom.models.prior.PriorSource` that takes the steps of a network of pairs of scans.
 
-    A step whose covariance is unknown, nan, is only where the match begins. Otherwise it pulls, and the last
-    motion has the say in what the network itself does not know. Where the network gives no step, for
-    instance since the scans are of another laser than its own, the matcher goes on alone, and says so
-    (*no prior*).
+    The prior is the weighted mean of the network's step and the last motion. A step with unknown covariance
+    (nan) is only the initial guess of the match. If the network gives no step, for instance because the scans
+    are not from its laser, the matcher continues without it, with the note *no prior*.
 
     Args:
-        stepper: the network, at its start.
+        stepper: the network, without earlier scans.
 
     Attributes:
+        description: that of the network.
         period: seconds between scans in its training.
     """
 
     def __init__(self, stepper: Stepper) -> None:
         self._tracker = PairTracker(stepper)
-        self.period = self._tracker.period
+        self.description, self.period = self._tracker.description, self._tracker.period
         self._forget()
 
     def reset(self) -> None:
@@ -74,12 +82,12 @@ class NetworkPrior:
         self._forget()
 
     def _forget(self) -> None:
-        self._told: Step | None = None
-        self._errors = np.ones(3)  # mean squares of its errors over the variances that it told
+        self._step: Step | None = None
+        self._errors = np.ones(3)  # means of the network's squared errors divided by its variances
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes a scan that is not compared with those before; why the network cannot."""
-        self._told = None
+        """Takes a scan that is not compared with those before; returns a note if it cannot be used."""
+        self._step = None
         notes = self._tracker.begin(scan)
         return () if self.has_seen else _without_prior(notes)
 
@@ -89,92 +97,115 @@ class NetworkPrior:
         return self._tracker.has_seen
 
     def expect(
-        self, scan: Scan, periods: int, seconds: float | None, held: Prior
+        self, scan: Scan, periods: int, seconds: float | None, last_motion: Prior
     ) -> tuple[Prior, tuple[str, ...]]:
-        """The network's step, or the last motion where it has none."""
+        """The prior from the network's step and the last motion, or the last motion alone; and notes."""
         if not self.has_seen:
-            return held, self.begin(scan)
+            return last_motion, self.begin(scan)
         found = self._tracker.register(scan, periods, seconds)
         if not found.is_estimated:
-            self._told = None
-            return held, _without_prior(found.notes)
-        self._told = _widen(found.step)
-        larger = np.sqrt(np.maximum(self._errors, 1.0))
+            self._step = None
+            return last_motion, _without_prior(found.notes)
+        self._step = _inflate(found.step)
+        factors = np.sqrt(np.maximum(self._errors, 1.0))
         x, y, heading = found.step.array().tolist()
-        told = Step(x, y, heading, self._told.covariance * np.outer(larger, larger))
-        return make_prior(told, held), ()
+        measured = Step(x, y, heading, self._step.covariance * np.outer(factors, factors))
+        return make_prior(measured, last_motion), ()
 
     def compare(self, step: FloatArray, is_determined: bool) -> None:
-        """Learns from a match that needs no prior how far off the network is in this place."""
-        if self._told is None or not (is_determined and np.isfinite(self._told.covariance).all()):
+        """Updates the network's mean errors in this environment from a match that needed no prior."""
+        if self._step is None or not (is_determined and np.isfinite(self._step.covariance).all()):
             return
-        off = step - self._told.array()
-        off[2] = wrap_angle(off[2])
-        self._errors += (off**2 / np.diag(self._told.covariance) - self._errors) / COMPARED
+        difference = step - self._step.array()
+        difference[2] = wrap_angle(difference[2])
+        self._errors += (difference**2 / np.diag(self._step.covariance) - self._errors) / AVERAGED_MATCHES
 
 
-def _widen(step: Step) -> Step:
-    """A network's step with deviations that fit other places than those of its training."""
+def _inflate(step: Step) -> Step:
+    """A network's step with a larger covariance, which also suits places unlike those of its training."""
     least = np.diag(np.square([LEAST_DISTANCE, LEAST_DISTANCE, LEAST_TURN]))
     return Step(step.x, step.y, step.heading, INFLATION**2 * step.covariance + least)
 
 
-def make_prior(told: Step, held: Prior) -> Prior:
-    """A measured step as a prior: the mean of it and of the last motion, each by its weight.
+def make_prior(measured: Step, last_motion: Prior) -> Prior:
+    """The prior from a measured step and the last motion: their mean, weighted by their covariances.
 
     Args:
-        told: the step; where its covariance is nan, it is only where the match begins.
-        held: the last motion.
+        measured: the step; with an unknown covariance (nan) it is only the initial guess of the match.
+        last_motion: the prior from the last motion.
+
+    Example:
+        Both have the same covariance, so that the prior lies in the middle:
+
+        >>> last_motion = Prior(np.array([1.0, 0.0, 0.0]), np.eye(3))
+        >>> make_prior(Step(2.0, 0.0, 0.0, np.eye(3)), last_motion).step.tolist()
+        [1.5, 0.0, 0.0]
     """
-    off = told.array() - held.step
-    off[2] = wrap_angle(off[2])
-    if not np.isfinite(told.covariance).all():
-        spread = held.covariance + np.diag(off**2)
-        return Prior(held.step + off, spread, None, STANDS, comes_from_scan=True)
-    gain = held.covariance @ np.linalg.inv(held.covariance + told.covariance)
+    difference = measured.array() - last_motion.step
+    difference[2] = wrap_angle(difference[2])
+    if not np.isfinite(measured.covariance).all():
+        spread = last_motion.covariance + np.diag(difference**2)
+        return Prior(last_motion.step + difference, spread, None, NETWORK_STEP, comes_from_scan=True)
+    gain = last_motion.covariance @ np.linalg.inv(last_motion.covariance + measured.covariance)
     rest = np.eye(3) - gain
-    covariance = rest @ held.covariance @ rest.T + gain @ told.covariance @ gain.T
-    return Prior(held.step + gain @ off, covariance, told.covariance, STANDS, comes_from_scan=True)
+    covariance = rest @ last_motion.covariance @ rest.T + gain @ measured.covariance @ gain.T
+    return Prior(
+        last_motion.step + gain @ difference,
+        covariance,
+        measured.covariance,
+        NETWORK_STEP,
+        comes_from_scan=True,
+    )
 
 
 def _without_prior(notes: tuple[str, ...]) -> tuple[str, ...]:
-    """Why there is no step of the network, in one note."""
+    """The note that there is no step of the network, with the notes on the scan as its reasons."""
     return (f"{NO_PRIOR}: {', '.join(notes)}, and scan matching goes on alone",)
 
 
 class FusedTracker(MatcherTracker):
-    """The matcher with the steps of a network as its priors.
+    """The matcher with priors from another source, usually a network.
 
     Args:
-        source: of the priors.
-        deskew: as of :class:`rcnn_odom.models.matcher.MatcherTracker`.
+        source: source of the priors.
+        deskew: as in :class:`rcnn_odom.models.matcher.MatcherTracker`.
+
+    Attributes:
+        period: seconds between scans in the training of the source; nan without one.
+        description: that of the source's network; None without one.
     """
 
     def __init__(self, source: PriorSource, deskew: bool = True) -> None:
         super().__init__(deskew=deskew, source=source)
         self.period = getattr(source, "period", self.period)
+        self.description: Description | None = getattr(source, "description", None)
 
 
 def fused_tracker(network: str, deskew: bool = True, threads: int = 1) -> FusedTracker:
-    """The matcher with a network's steps as priors.
+    """Makes the matcher with a network's steps as priors.
 
     Args:
-        network, deskew: as of :class:`FusedOptions` and :class:`FusedTracker`.
-        threads: of the network's computation.
+        network: as in :class:`FusedOptions`.
+        deskew: as in :class:`FusedTracker`.
+        threads: number of threads for the network.
 
     Raises:
-        InputError: no such file, or none of ``rcnn-odom export``.
+        InputError: the file does not exist, or ``rcnn-odom export`` has not written it.
     """
-    source = LastMotion(is_measured=True) if network == HELD else _load(network, threads)
+    source = LastMotion(is_measured=True) if network == HELD else _load_network(network, threads)
     return FusedTracker(source, deskew)
 
 
-def _load(network: str, threads: int) -> NetworkPrior:
+def _load_network(network: str, threads: int) -> NetworkPrior:
     return NetworkPrior(OnnxStepper(find_file(network), threads))
 
 
 class Fused(Model):
-    """The matcher with the steps of a trained network as its priors."""
+    """Scan matching with the steps of a trained network as its priors.
+
+    Raises:
+        InputError: there is no such network.
+    """
 
     name = "fused"
     Options = FusedOptions
@@ -183,13 +214,17 @@ class Fused(Model):
     def __init__(self, options: dict[str, str], sensor: Sensor) -> None:
         super().__init__(options, sensor)
         if (network := options["network"]) != HELD:
-            find_file(network)  # before any recording is read
+            find_file(network)  # reports a missing file before any recording is read
 
     def tracker(self) -> FusedTracker:
-        """The same in a stream."""
+        """The tracker for a stream of scans, with the same options."""
         return fused_tracker(self.options["network"], self.deskew != "off")
 
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive, those that ``rcnn-odom run --model fused`` gives."""
+        """The steps of a whole drive, which equal those of ``rcnn-odom run --model fused``.
+
+        Raises:
+            InputError: ``rcnn-odom export`` has not written the network's file.
+        """
         deskew = wants_deskew(self.deskew, drive.is_compensated)
         return estimate_by_tracking(fused_tracker(self.options["network"], deskew), drive.raw_scans())
