@@ -38,7 +38,7 @@ def test_good_ones_pass_and_defaults_are_filled_in():
     ("change", "message"),
     [
         ({"inner": {"size": 0}}, "group.inner.size=0: must be a whole number from 1"),
-        ({"inner": 3}, "group.inner=3: has parts to set, for instance group.inner.size="),
+        ({"inner": 3}, "group.inner=3: is a group; set its members, for instance group.inner.size="),
         ({"flag": 1}, "group.flag=1: must be true or false"),
         ({"rate": 1.0}, "group.rate=1.0: must be a number above 0 and below 1"),
         ({"rate": float("nan")}, "group.rate=nan: must be a number"),

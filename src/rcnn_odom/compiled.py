@@ -1,11 +1,11 @@
-"""Functions compiled by numba, which are compiled only once on a machine where that is possible.
+"""Functions that numba compiles only once on a machine, if the machine code can be stored.
 
-Numba keeps their machine code beside the source, or, where that cannot be written, in the user's folder for
-caches, or in ``NUMBA_CACHE_DIR``. Where none of them can be written it refuses to load the function; here the
-function is then compiled anew in every process.
+Numba stores the machine code beside the source. If it cannot write there, it uses the user's cache folder or
+``NUMBA_CACHE_DIR``. If it cannot write to any of them, it refuses to load the function; here the function is
+then compiled again in every process.
 
-Numba notices a change of the file in which a function is written, but not of the functions and constants that
-it takes from other files: compiled functions must use those of their own file only.
+Numba notices a change of the file that contains a function, but not a change of functions and constants that
+the function takes from other files. A compiled function must therefore use only those of its own file.
 """
 
 from collections.abc import Callable
@@ -15,17 +15,18 @@ from numba import njit
 
 
 def compiled(function: Callable[..., Any], how: Callable[..., Any] = njit) -> Any:
-    """Decorates a function that numba compiles when it is first called.
+    """Decorator: numba compiles the function at its first call.
 
     Args:
-        function: of numbers and arrays.
-        how: ``numba.njit`` or ``numba.vectorize``.
+        function: takes numbers and arrays.
+        how: numba's decorator, ``numba.njit`` or ``numba.vectorize``.
 
-    >>> @compiled
-    ... def double(x):
-    ...     return 2 * x
-    >>> double(2)
-    4
+    Example:
+        >>> @compiled
+        ... def double(x):
+        ...     return 2 * x
+        >>> double(2)
+        4
     """
     try:
         return how(cache=True)(function)

@@ -2,8 +2,8 @@
 
 
 class InputError(Exception):
-    """Bad input of a user: one line that names the file (line, frame) and what to do about it.
+    """Wrong input of a user. The message is one line that names the file (line, frame) and says what to do.
 
-    The command line tools print the message alone and exit with status 1; everything else that is
-    raised is a fault of the program and keeps its traceback.
+    The command line tools print only the message and exit with status 1. Every other exception is a fault of
+    the program and keeps its traceback.
     """

@@ -1,4 +1,4 @@
-"""Files that are whole or not there, and locks that end with their process."""
+"""Atomic writing of files, and file locks that end with their process."""
 
 import logging
 import os
@@ -13,14 +13,14 @@ log = logging.getLogger(__name__)
 
 
 def write_atomically(path: Path, write: bytes | str | Callable[[IO[bytes]], object]) -> None:
-    """Writes a file at once or not at all: what was there before stays until all is on the disk.
+    """Writes a whole file or nothing: the old file stays until the new one is completely on the disk.
 
     Args:
-        path: of the file; its folder is made where missing.
-        write: the content, or a function that writes it into an open file.
+        path: the file to write; its folder is created if missing.
+        write: the content, or a function that writes the content to an open file.
 
     Raises:
-        OSError: it cannot be written; nothing is left behind.
+        OSError: the file cannot be written; no partial file is left behind.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
@@ -39,23 +39,23 @@ def write_atomically(path: Path, write: bytes | str | Callable[[IO[bytes]], obje
 
 
 @contextmanager
-def one_at_a_time(folder: Path, work: str, what: str) -> Iterator[None]:
-    """Lets one process at a time do a piece of work; the others wait.
+def one_at_a_time(folder: Path, lock_name: str, activity: str) -> Iterator[None]:
+    """Allows one process at a time to do a piece of work; the other processes wait.
 
-    The lock ends with its process, however that ends. On a network file system it needs a working
-    ``flock``, as NFS 4 and Lustre have.
+    The lock ends with its process, also if the process is killed. A network file system must support
+    ``flock``, as NFS 4 and Lustre do.
 
     Args:
-        folder: all of them see it; made where missing.
-        work: by this name, fit for a file.
-        what: it is, for the message of those who wait.
+        folder: folder of the lock, visible to all the processes; it is created if missing.
+        lock_name: name of the work, used in the file name of the lock.
+        activity: what the working process does ("encoding scans"), for the log message of those that wait.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    lock = FileLock(folder / f".{work}.lock")
+    lock = FileLock(folder / f".{lock_name}.lock")
     try:
         lock.acquire(timeout=0)
     except Timeout:
-        log.info("waiting for another process that is %s", what)
+        log.info("waiting for another process that is %s", activity)
         lock.acquire()
     try:
         yield
@@ -65,7 +65,7 @@ def one_at_a_time(folder: Path, work: str, what: str) -> Iterator[None]:
 
 @contextmanager
 def lock_if_free(path: Path) -> Iterator[bool]:
-    """Holds a lock if no other process does, which is the value; the lock ends with its process."""
+    """Takes a lock if it is free. The context's value is whether it was; the lock ends with its process."""
     lock = FileLock(path)
     try:
         lock.acquire(timeout=0)

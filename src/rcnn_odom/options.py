@@ -1,4 +1,4 @@
-"""Options of models, data and trainer: what each may be stands beside it, in the fields of a dataclass."""
+"""Options of models, data and trainer: fields of a dataclass, each with the values that it allows."""
 
 import math
 import types
@@ -9,7 +9,7 @@ from typing import Any
 
 from rcnn_odom.errors import InputError
 
-WORDS = {int: "a whole number", float: "a number", bool: "true or false", str: "a word"}
+TYPE_NAMES = {int: "a whole number", float: "a number", bool: "true or false", str: "text"}
 
 
 def option(
@@ -25,11 +25,21 @@ def option(
     """A field of an options dataclass, with its bounds.
 
     Args:
-        default: makes it one that may be left out.
+        default: value of an option that the user leaves out; without a default the option is required.
         above, least, below: bounds of a number: greater than, at least, less than.
-        choices: words that are allowed.
-        fits: a condition that no bound can say.
-        wanted: in words what a value must be; None: told from the bounds.
+        choices: the allowed texts.
+        fits: a condition that the bounds cannot express.
+        wanted: describes the allowed values for the error message, which says ``must be WANTED``; if empty,
+            the description is made from the type and the bounds.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     kernel_size: int = option(fits=lambda size: size % 2 == 1, wanted="odd")
+        ...     dropout: float = option(least=0, below=1, default=0.0)
+        >>> Options(kernel_size=3)
+        Options(kernel_size=3, dropout=0.0)
     """
     bounds = {
         "above": above,
@@ -43,53 +53,73 @@ def option(
 
 
 def check_options(options: type, values: dict[str, Any], prefix: str, *, partly: bool = False) -> None:
-    """Compares the values of options with their dataclass; nested groups with nested dataclasses.
+    """Checks the values of options against their dataclass; nested groups against nested dataclasses.
 
-    A field whose type admits None may be null. Fields with a default may be left out, and are
-    filled in unless ``partly``.
+    An option may be null if its type allows None. An option with a default may be missing; its default is
+    then added to ``values``, unless ``partly`` is set.
 
     Args:
-        options: a dataclass.
+        options: a dataclass whose fields are made by :func:`option`.
         values: plain values by name.
-        prefix: of their names on the command line, ``model.``.
-        partly: values may be missing, or refer to another by ``${...}``, and others that the dataclass does
-            not know be there.
+        prefix: of the names on the command line, for instance ``model.``.
+        partly: accept values that are missing, that refer to another option by ``${...}``, or that the
+            dataclass does not have.
 
     Raises:
         InputError: an option is missing, unknown, of another type, or outside its bounds.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> @dataclass
+        ... class Options:
+        ...     dropout: float = option(least=0, below=1, default=0.0)
+        >>> values = {}
+        >>> check_options(Options, values, "model.")
+        >>> values
+        {'dropout': 0.0}
+        >>> check_options(Options, {"dropout": 1.5}, "model.")
+        Traceback (most recent call last):
+            ...
+        rcnn_odom.errors.InputError: model.dropout=1.5: must be a number from 0 and below 1
     """
-    known = {each.name: each for each in fields(options)}
+    known = {option_field.name: option_field for option_field in fields(options)}
     types_of = typing.get_type_hints(options)
     for name in set() if partly else values.keys() - known.keys():
         raise InputError(f"{prefix}{name}: there is no such option; there are {', '.join(sorted(known))}")
-    for name, each in known.items():
+    for name, option_field in known.items():
         if name not in values:
-            if not partly and each.default is MISSING:
+            if not partly and option_field.default is MISSING:
                 raise InputError(
-                    f"{prefix}{name} is missing; it may be that of an older version: train again"
+                    f"{prefix}{name} is missing; the settings may be those of an older version: train again"
                 )
             if not partly:
-                values[name] = each.default
+                values[name] = option_field.default
         elif isinstance(values[name], dict) or not (partly and "${" in str(values[name])):
-            _check(f"{prefix}{name}", values[name], types_of[name], each.metadata, partly)
+            _check_value(f"{prefix}{name}", values[name], types_of[name], option_field.metadata, partly)
 
 
-def _check(name: str, value: Any, kind: Any, bounds: Any, partly: bool) -> None:
+def _check_value(name: str, value: Any, kind: Any, bounds: Any, partly: bool) -> None:
+    """Checks one value against its type ``kind`` and its bounds.
+
+    Raises:
+        InputError: the value, or one in its group, is not allowed.
+    """
     if is_dataclass(kind):
         if not isinstance(value, dict):
             first = next(iter(fields(kind))).name
-            raise InputError(f"{name}={value}: has parts to set, for instance {name}.{first}=...")
+            raise InputError(f"{name}={value}: is a group; set its members, for instance {name}.{first}=...")
         check_options(kind, value, f"{name}.", partly=partly)  # type: ignore[arg-type]
         return
     is_union = typing.get_origin(kind) in (types.UnionType, typing.Union)
     allowed = typing.get_args(kind) if is_union else (kind,)
     if value is None and type(None) in allowed:
         return
-    if not (_is_kind(value, allowed) and _within(value, bounds)):
-        raise InputError(f"{name}={value}: {_wanted(allowed, bounds)}")
+    if not (_has_allowed_type(value, allowed) and _is_within_bounds(value, bounds)):
+        raise InputError(f"{name}={value}: {_describe_allowed(allowed, bounds)}")
 
 
-def _is_kind(value: Any, allowed: tuple[Any, ...]) -> bool:
+def _has_allowed_type(value: Any, allowed: tuple[Any, ...]) -> bool:
+    """Whether a value has one of the allowed types; a whole number is also a float, nan and inf are not."""
     kinds = {typing.get_origin(kind) or kind for kind in allowed}
     if isinstance(value, bool) or value is None:
         return bool in kinds and value is not None
@@ -98,7 +128,7 @@ def _is_kind(value: Any, allowed: tuple[Any, ...]) -> bool:
     return type(value) in kinds and (not isinstance(value, float) or math.isfinite(value))
 
 
-def _within(value: Any, bounds: Any) -> bool:
+def _is_within_bounds(value: Any, bounds: Any) -> bool:
     if isinstance(value, bool):
         return True
     return (
@@ -110,13 +140,13 @@ def _within(value: Any, bounds: Any) -> bool:
     )
 
 
-def _wanted(allowed: tuple[Any, ...], bounds: Any) -> str:
-    """In words what a value must be."""
+def _describe_allowed(allowed: tuple[Any, ...], bounds: Any) -> str:
+    """Describes the allowed values of an option for an error message."""
     if bounds.get("wanted"):
         return f"must be {bounds['wanted']}"
     if bounds.get("choices"):
         return f"choose one of {', '.join(bounds['choices'])}"
-    kinds = ["null" if kind is type(None) else WORDS.get(kind, str(kind)) for kind in allowed]
+    kinds = ["null" if kind is type(None) else TYPE_NAMES.get(kind, str(kind)) for kind in allowed]
     words = " or ".join(sorted(kinds, key="null".__ne__))
     limits = [
         f"{text} {bounds[key]:g}"

@@ -1,6 +1,6 @@
-"""Finds models, recording formats and metrics by their name, those of other packages too.
+"""Finds models, recording formats and metrics by name, including those of other packages.
 
-A package adds its own by Python's entry points, in its ``pyproject.toml``::
+Another package registers its own by Python's entry points, in its ``pyproject.toml``::
 
     [project.entry-points."rcnn_odom.models"]
     my_model = "my_package.my_model:MyModel"
@@ -19,57 +19,83 @@ from rcnn_odom.errors import InputError
 
 
 def modules_in(package: str, last: tuple[str, ...] = ()) -> Iterator[ModuleType]:
-    """Imports the modules of a package, one after the other by name, some of them after the others."""
+    """Imports the modules of a package one after the other, in the order of their names.
+
+    Args:
+        package: full name of the package.
+        last: names of modules that are imported after all the others, in this order.
+
+    Example:
+        >>> [module.__name__ for module in modules_in("email.mime", last=("application",))][-2:]
+        ['email.mime.text', 'email.mime.application']
+    """
     names = {module.name for module in iter_modules(import_module(package).__path__)}
     for name in (*sorted(names - set(last)), *last):
         yield import_module(f"{package}.{name}")
 
 
 def collect(
-    what: str, built_in: Mapping[str, Any], check: Callable[[str, Any], None], only: str | None = None
+    kind: str, built_in: Mapping[str, Any], check: Callable[[str, Any], None], only: str | None = None
 ) -> dict[str, Any]:
-    """Everything of one kind by its name: the project's own, and those that entry points add.
+    """All models, all recording formats or all metrics by name: built-in ones and those of entry points.
 
     Args:
-        what: the kind, ``model``, ``recording format`` or ``metric``; its entry points are in the group
+        kind: ``model``, ``recording format`` or ``metric``. The group of its entry points is
             ``rcnn_odom.models``, ``rcnn_odom.recording_formats`` or ``rcnn_odom.metrics``.
-        built_in: the project's own.
-        check: raises InputError where one that was added lacks a part.
-        only: of those that were added import the one of this name alone; the others are None.
+        built_in: those of this project.
+        check: gets the name and the object of an entry point; raises InputError if the object lacks a part.
+        only: import only the entry point of this name; the values of the other entry points are None.
 
     Raises:
         InputError: two have the same name, or one cannot be imported or lacks a part.
+
+    Example:
+        >>> collect("metric", {"drift": "the built-in one"}, check=print, only="drift")["drift"]
+        'the built-in one'
     """
     found = dict(built_in)
-    for entry in entry_points(group=f"rcnn_odom.{what.replace(' ', '_')}s"):
+    for entry in entry_points(group=f"rcnn_odom.{kind.replace(' ', '_')}s"):
         if entry.name in found:
             raise InputError(
-                f"two {what}s are called {entry.name}, one of them {entry.value}; rename it in the entry "
+                f"two {kind}s are called {entry.name}, one of them {entry.value}; rename it in the entry "
                 "points of its package"
             )
         found[entry.name] = None
-        if only in (None, entry.name):  # what is broken in one package does not stop who asks for another
-            found[entry.name] = _load(what, entry)
+        if only in (None, entry.name):  # A broken package must not stop a user who asks for another one.
+            found[entry.name] = _load(kind, entry)
             check(entry.name, found[entry.name])
     return found
 
 
-def _load(what: str, entry: EntryPoint) -> Any:
+def _load(kind: str, entry: EntryPoint) -> Any:
     try:
         return entry.load()
-    except Exception as error:  # whatever the code of a stranger's package does
+    except Exception as error:  # The code of another package may raise anything.
         raise InputError(
-            f"{what} {entry.name}: {entry.value} cannot be imported ({type(error).__name__}: {error}); "
+            f"{kind} {entry.name}: {entry.value} cannot be imported ({type(error).__name__}: {error}); "
             "correct or uninstall its package"
         ) from error
 
 
-def choose(what: str, name: str, among: Mapping[str, Any]) -> Any:
-    """The one of this name.
+def choose(kind: str, name: str, among: Mapping[str, Any]) -> Any:
+    """Returns the entry of this name.
+
+    Args:
+        kind: of the entries, for the error message.
+        name: the wanted one.
+        among: all entries by name.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such entry.
+
+    Example:
+        >>> choose("model", "matcher", {"matcher": 1, "cnn_reg": 2})
+        1
+        >>> choose("model", "resnet", {"matcher": 1, "cnn_reg": 2})
+        Traceback (most recent call last):
+            ...
+        rcnn_odom.errors.InputError: no model is called resnet; there are cnn_reg, matcher
     """
     if name not in among:
-        raise InputError(f"no {what} is called {name}; there are {', '.join(sorted(among))}")
+        raise InputError(f"no {kind} is called {name}; there are {', '.join(sorted(among))}")
     return among[name]

@@ -256,7 +256,7 @@ def test_frames_of_a_step_taken_before_its_turn(motions, capsys):
 @pytest.mark.parametrize("frames", ["2:5", "0:2", "5:9"])
 def test_frames_outside_of_the_drive(motions, capsys, frames):
     assert main(["frames", str(motions), "--frames", frames]) == 1
-    message = f"05_motions.csv: --frames {frames} reaches outside of the drive, which has 4 frames: 1:4\n"
+    message = f"05_motions.csv: --frames {frames} is outside of the drive, which has 4 frames: 1:4\n"
     assert one_line_error(capsys).endswith(message)
 
 
@@ -275,7 +275,7 @@ def test_frames_outside_of_the_drive(motions, capsys, frames):
         (f"{HEADER}\n1,1,0,1\n", ".csv:2: found 4 fields, but a line has 5"),
         (f"{HEADER}\n1,1,0,1,0\n\n2,1,0,1,0\n", ".csv:3: found 1 fields, but a line has 5"),
         (f"{HEADER}\n1,nan,0,1,0\n", ".csv:2: found nan or inf"),
-        (f"{HEADER}\n1,1,0,1,0\n3,1,0,1,0\n", ".csv:3: frame 3 where 2 comes"),
+        (f"{HEADER}\n1,1,0,1,0\n3,1,0,1,0\n", ".csv:3: frame 3 in place of 2"),
     ],
 )
 def test_bad_files_of_motions_give_one_line(tmp_path, capsys, text, message):
@@ -310,7 +310,7 @@ def test_simulate_writes_what_the_simulator_gives(tmp_path, capsys):
     options = ["--sequence", "00", "my drive", "--frames", "3", "--seed", "7", "--without", "movers"]
     assert main(["simulate", "--out", str(tmp_path / "out"), *options]) == 0
     assert capsys.readouterr().out == (
-        f"wrote 00, my drive to {tmp_path}/out; score a trained network there: "
+        f"wrote 00, my drive to {tmp_path}/out; score a trained network on them: "
         f'rcnn-odom evaluate data=kitti data.root={tmp_path}/out \'data.test=["00", "my drive"]\'\n'
     )
     for name in ("00", "my drive"):

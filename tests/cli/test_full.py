@@ -71,19 +71,21 @@ def robot(monkeypatch, request):
 @pytest.mark.parametrize("arguments", [[], ["--help"], ["--multirun", "model=rcnn_reg"], ["a", "--json"]])
 def test_without_training_commands_say_what_to_install(robot, capsys, name, arguments):
     assert main([name, *arguments]) == 1
-    told = f"rcnn-odom {name} needs more than rcnn-odom-robot has: pip install rcnn-odom"
+    told = f"rcnn-odom {name} needs the full distribution, not only rcnn-odom-robot: pip install rcnn-odom"
     assert capsys.readouterr().err == f"rcnn-odom: error: {told}\n"
 
 
 def test_without_training_the_help_says_so(robot, capsys):
     with pytest.raises(SystemExit):
         main(["--help"])
-    assert capsys.readouterr().out.count("needs more: pip install rcnn-odom") == 4
+    assert capsys.readouterr().out.count("needs the full distribution: pip install rcnn-odom") == 4
 
 
 def test_without_training_a_checkpoint_cannot_run(robot, capsys, tmp_path):
     assert main(["run", "a.bag", "--model", "best.ckpt", "--out", str(tmp_path)]) == 1
-    told = "best.ckpt: a checkpoint needs more than rcnn-odom-robot has: pip install rcnn-odom"
+    told = (
+        "best.ckpt: a checkpoint needs the full distribution, not only rcnn-odom-robot: pip install rcnn-odom"
+    )
     assert capsys.readouterr().err == f"rcnn-odom: error: {told}\n"
 
 

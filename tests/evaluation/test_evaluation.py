@@ -454,11 +454,11 @@ def test_a_metric_of_another_package_is_everywhere(monkeypatch, tmp_path):
 @pytest.mark.parametrize(
     ("name", "metric", "said"),
     [
-        ("best", most_ahead, "is no Metric of"),
+        ("best", most_ahead, "is not a Metric of"),
         ("best", FARTHEST, "is named farthest_m"),
         ("floor", replace(FARTHEST, name="floor"), "is named floor"),
-        ("best", replace(FARTHEST, name="best", combine="median"), "combine mean, frames or max"),
-        ("best", replace(FARTHEST, name="best", compute=3), "give a function to compute it"),
+        ("best", replace(FARTHEST, name="best", combine="median"), "set combine to mean, frames or max"),
+        ("best", replace(FARTHEST, name="best", compute=3), "give it a function compute"),
         ("drift", replace(FARTHEST, name="drift"), "two metrics are called drift"),
     ],
 )

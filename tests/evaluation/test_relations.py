@@ -188,7 +188,7 @@ def test_bad_files_give_one_line(recording, tmp_path, capsys):
         ("", "is empty"),
         ("\n".join([lines[0], "1 2 3"]), "bad.relations:2: found 3 fields, but a relation has 8 numbers"),
         ("\n".join([*lines[:2], lines[2].replace(" 0 0 0 ", " 0 nan 0 ")]), "bad.relations:3: found"),
-        ("1 2 0 0 0 0 0 0", "none of the 1 relations has its times in the log"),
+        ("1 2 0 0 0 0 0 0", "the log has the scans of none of the 1 relations"),
     ):
         (folder / "bad.relations").write_text(text)
         assert message in refuse(capsys, folder, good, "bad.relations")

@@ -10,7 +10,7 @@ import yaml
 from rcnn_odom.cli import main
 from rcnn_odom.evaluation.sweep_report.build import make_report
 from rcnn_odom.evaluation.sweep_report.document import code, duration, escape, markdown_table
-from rcnn_odom.evaluation.sweep_report.figures import length_curve, middle_run, trajectory
+from rcnn_odom.evaluation.sweep_report.figures import length_curve, median_run, trajectory
 from rcnn_odom.evaluation.sweep_report.folders import read_run
 from rcnn_odom.recordings.trajectory import file_name
 from summary_runs import begin_run, finish_run, method, write_trajectories
@@ -92,7 +92,7 @@ def test_the_tables_hold_means_and_deviations(sweep, capsys):
     logs = np.log([[0.11, 0.13, 0.10], [0.21, 0.23, 0.19]])
     assert difference[3] == f"{np.exp((logs[0] - logs[1]).mean()):.2f}"
     assert "Warning" not in text
-    assert "Trained for 9 min 00 s in all" in text
+    assert "Total training time: 9 min 00 s, of the 6 runs whose time is known." in text
     assert "Versions: torch 2.13.0, numpy 2.4.6." in text
     assert "kernel_size=5 3 17.00 ± 1.00 10.33 ± 1.53 12.33 ± 1.53" in " ".join(output.split())
     assert output.splitlines()[-2:] == [f"{sweep}/report.md", f"{sweep}/report.html"]
@@ -132,14 +132,14 @@ def test_what_is_not_finished_comes_first_and_in_no_mean(bare, capsys):
     (bare / "kernel_size=5,seed=2" / "metrics.json").write_text("{")
     begin_run(bare / "<b>x|y", ["model=cnn_cls", "model.kernel_size=7", "seed=0"])
     assert main(["report", str(bare)]) == 0
-    assert "not finished, and in no mean: 3;" in capsys.readouterr().out
+    assert "runs that did not finish: 3;" in capsys.readouterr().out
     text = (bare / "report.md").read_text()
     assert "Of 7 runs: 4 finished, 1 failed, 1 unfinished, 1 damaged." in text
-    warning = text[: text.index("Swept:")]
+    warning = text[: text.index("Swept options:")]
     assert warning.count("> - **") == 3
     assert row(text, "kernel_size=5")[1:6] == ["1 (fewer)", "16.00", "10.00", "12.00", "11.00"]
     assert row(text, "kernel_size=7")[1:6] == ["0 (fewer)", "-", "-", "-", "-"]
-    assert row(section(text, "Differences"), "kernel_size=5")[1] == "one seed: nothing can be said"
+    assert row(section(text, "Differences"), "kernel_size=5")[1] == "one seed: nothing can be tested"
     page = (bare / "report.html").read_text()
     assert "a|b &#60;img src=x&#62; &#42;c&#42;" in page.replace("&#124;", "|")
     assert "<img src=x>" not in page
@@ -164,20 +164,22 @@ def test_equal_settings_show_no_difference(tmp_path):
         "1.000",
     ]
     assert row(section(text, "Differences"), "kernel_size=5") == cells
-    assert "in test drift: 0 of 1." in text
-    assert "Not drawn, `5-1`: " in text
+    assert "in test drift is shown for 0 of 1 settings." in text
+    assert "The trajectories of `5-1` are missing: " in text
 
 
 def test_the_best_is_told_by_validation(bare):
     make_report(bare)
     text = (bare / "report.md").read_text()
     best = "**kernel_size=3**, 16.00 % over 3 seeds. Its mean test drift is 21.00 %."
-    others = "It is the reference. Shown to differ from the reference in test drift: 1 of 1."
+    others = (
+        "It is the reference. A difference from the reference in test drift is shown for 1 of 1 settings."
+    )
     assert f"Lowest mean validation drift: {best} {others}" in text
     assert "the reference **kernel_size=3** (the paper's choice)" in text
     make_report(bare, reference=["model.kernel_size=5"])
     text = (bare / "report.md").read_text()
-    assert f"{best} Against the reference, kernel_size=5: higher drift." in text
+    assert f"{best} Compared with the reference, kernel_size=5: higher drift." in text
     assert "the reference **kernel_size=5** (chosen by --reference)" in text
 
 
@@ -189,7 +191,7 @@ def test_one_seed_shows_no_difference(tmp_path):
     text = (tmp_path / "report.md").read_text()
     assert (
         "Lowest mean validation drift: **beta=2.0**, 10.00 % over one seed. Its mean test drift is 20.00 %. "
-        "No setting has two seeds, and one seed shows no difference." in text
+        "No setting has two seeds, and one seed cannot show a difference." in text
     )
     assert "## Differences" not in text
     assert "reference" not in text
@@ -214,11 +216,11 @@ def test_the_command_is_hydras(bare):
     }
     (bare / "multirun.yaml").write_text(yaml.safe_dump({"hydra": {"overrides": overrides}}))
     make_report(bare)
-    origin = section((bare / "report.md").read_text(), "Where it comes from")
+    origin = section((bare / "report.md").read_text(), "Commands and versions")
     command = "rcnn-odom train -m hydra/launcher=joblib +sweeps=kernel_size 'data.val=[c[:0.5]]'"
-    assert f"The last command for this folder:\n\n    {command}\n" in origin
+    assert f"Last command of this folder:\n\n    {command}\n" in origin
     alone = "    rcnn-odom train model=cnn_cls model.kernel_size=5 seed=2"
-    assert alone in origin.split("Each run alone:\n\n")[1].splitlines()
+    assert alone in origin.split("Commands of the single runs:\n\n")[1].splitlines()
     assert len(re.findall("    (rcnn-odom train.*)", origin)) == 1 + 6
 
 
@@ -230,7 +232,7 @@ def test_the_command_is_hydras(bare):
             "--reference kernel_size=9: no setting has it: kernel_size=3; kernel",
         ),
         (["--reference", "9"], "9: write KEY=VALUE"),
-        (["--only", "model.kernel_size=9"], "no run has it; they have 3, 5"),
+        (["--only", "model.kernel_size=9"], "no run has this value; they have 3, 5"),
     ],
 )
 def test_mistaken_choices_are_told(bare, capsys, arguments, message):
@@ -265,7 +267,7 @@ def test_other_versions_are_told(tmp_path):
     assert "> **Warning: the runs were made with different versions of torch.**" in text
     assert "torch 2.13.0 and 2.14" in text
     commands = "    rcnn-odom train seed=0\n    rcnn-odom train seed=1\n"
-    assert f"Each run alone:\n\n{commands}" in text
+    assert f"Commands of the single runs:\n\n{commands}" in text
 
 
 def test_curves_are_means_over_the_segments_of_all_sequences(tmp_path):
@@ -282,11 +284,11 @@ def test_curves_are_means_over_the_segments_of_all_sequences(tmp_path):
 
 def test_the_run_that_is_shown_has_the_median_validation_drift(bare):
     runs = [read_run(bare / f"kernel_size=3,seed={seed}", str(seed)) for seed in (2, 0, 1)]
-    assert middle_run(runs).name == "1"
-    assert middle_run(runs[:2]).name == "0"
+    assert median_run(runs).name == "1"
+    assert median_run(runs[:2]).name == "0"
     make_report(bare)
     text = section((bare / "report.md").read_text(), "Trajectories")
-    assert "Not drawn, `kernel_size=3,seed=1`: " in text
+    assert "The trajectories of `kernel_size=3,seed=1` are missing: " in text
 
 
 def test_trajectories_start_ahead(finished):

@@ -106,7 +106,7 @@ def test_runs_that_are_not_finished_have_a_row_with_the_reason(tmp_path):
     missing = table[table["status"] == "missing"]
     assert list(missing.index) == ["kernel_size=3,seed=6", "kernel_size=3,seed=7"]
     assert set(missing["problem"]) == {
-        "the last command for this folder asked for it, and there is no such folder"
+        "the last command of the sweep should have made this folder, but it does not exist"
     }
     assert table.loc[table["status"] != "finished", "drift"].isna().all()
 
@@ -255,9 +255,13 @@ def test_mixed_data_are_told_apart_by_only(tmp_path):
     assert list(load_runs(tmp_path, ["data.test=[05,07]", "data.scale=full", "data=simulated"])["run"]) == [
         "b"
     ]
-    with pytest.raises(InputError, match=r"^--only data\.scale=big: no run has it; they have full, small$"):
+    with pytest.raises(
+        InputError, match=r"^--only data\.scale=big: no run has this value; they have full, small$"
+    ):
         load_runs(tmp_path, ["data.scale=big"])
-    with pytest.raises(InputError, match=r"^--only scale=full: no run has it; give an option's full name"):
+    with pytest.raises(
+        InputError, match=r"^--only scale=full: no run has this value; give an option's full name"
+    ):
         load_runs(tmp_path, ["scale=full"])
     with pytest.raises(InputError, match="write KEY=VALUE"):
         load_runs(tmp_path, ["full"])
@@ -277,14 +281,14 @@ def test_other_sequences_in_the_scores_are_refused(tmp_path):
 
 
 def test_no_runs_are_told(tmp_path):
-    with pytest.raises(InputError, match="nowhere: no such folder; name a sweep's"):
+    with pytest.raises(InputError, match="nowhere: no such folder; name the folder of a sweep"):
         load_runs(tmp_path / "nowhere")
     with pytest.raises(InputError, match="no run in it; train some"):
         load_runs(tmp_path)
     finish_run(tmp_path / "a", ["run=x"], DRIFTS, seed=None)
     with pytest.raises(InputError, match="no run in it, only evaluations"):
         load_runs(tmp_path)
-    with pytest.raises(InputError, match="is the folder of one run"):
+    with pytest.raises(InputError, match="this is the folder of one run"):
         load_runs(tmp_path / "a")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.stats import t, ttest_rel
 
-from rcnn_odom.evaluation.sweep_report.comparisons import compare
+from rcnn_odom.evaluation.sweep_report.comparisons import compare_settings
 from rcnn_odom.evaluation.sweep_report.statistics import Ratio, holm, mean_sd, paired_ratio, verdict
 
 
@@ -34,8 +34,8 @@ def test_too_few_seeds_say_nothing():
     assert paired_ratio({0: 0.1}, {1: 0.1}) == Ratio(0)
     one = paired_ratio({0: 0.1, 1: 0.3}, {0: 0.2})
     assert (one.seeds, one.ratio, one.p) == (1, pytest.approx(0.5), None)
-    assert verdict(one, None) == "one seed: nothing can be said"
-    assert verdict(Ratio(0), None) == "no seed in common: nothing can be said"
+    assert verdict(one, None) == "one seed: nothing can be tested"
+    assert verdict(Ratio(0), None) == "no common seed: nothing can be tested"
 
 
 def test_identical_drifts_show_no_difference():
@@ -52,7 +52,7 @@ def test_equal_ratios_cannot_be_tested(seeds):
     ratio = paired_ratio({seed: 0.7 * drift for seed, drift in second.items()}, second)
     assert ratio == Ratio(seeds, pytest.approx(0.7))
     assert holm([ratio.p, 0.03]) == [None, 0.03]
-    assert verdict(ratio, None) == "seeds do not scatter: nothing can be tested"
+    assert verdict(ratio, None) == "all seeds have the same ratio: nothing can be tested"
 
 
 def test_holm_by_hand():
@@ -76,12 +76,12 @@ def test_settings_are_compared_with_the_reference():
         ("c",): {0: 0.20, 1: 0.23, 2: 0.19},
         ("d",): {},
     }
-    found = compare(drifts, ("a",))
+    found = compare_settings(drifts, ("a",))
     assert [one.setting[0] for one in found] == ["b", "c", "d"]
     assert [one.verdict for one in found] == [
         "lower drift",
         "lower drift",
-        "no seed in common: nothing can be said",
+        "no common seed: nothing can be tested",
     ]
     p_values = [ttest_rel(*np.log([list(drifts[(x,)].values()), [0.30, 0.31, 0.29]])).pvalue for x in "bc"]
     smaller, larger = sorted(p_values)

@@ -1,4 +1,4 @@
-"""`rcnn-odom ...`: one file a command."""
+"""The command `rcnn-odom`. Each of its subcommands is one file of this package."""
 
 import argparse
 import os
@@ -12,21 +12,21 @@ from rcnn_odom.cli.full import add_missing, is_full
 from rcnn_odom.errors import InputError
 from rcnn_odom.terminal import show_any_text
 
-# Heavy imports stay inside the commands, so that --help answers at once.
+# Slow imports stay inside the commands, so that --help is fast.
 
-FULL = {"train": train, "evaluate": evaluate, "report": report, "export": export}
-"""Commands that a robot goes without."""
+FULL_COMMANDS = {"train": train, "evaluate": evaluate, "report": report, "export": export}
+"""Commands that ``rcnn-odom-robot`` does not have."""
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
+    """Runs the command line.
 
     Args:
-        argv: arguments without the program's name; None takes those of the process.
+        argv: arguments without the name of the program; None takes those of the process.
 
     Returns:
-        Exit status: 0, or 1 after one line on stderr about bad input, or 130 after Ctrl-C. Wrong usage
-        exits with 2.
+        Exit status: 0; 1 after one line on stderr about wrong input; 130 after Ctrl-C. Wrong usage of the
+        options ends the process with status 2.
     """
     show_any_text()
     arguments = _build_parser().parse_args(join_signed(sys.argv[1:] if argv is None else argv))
@@ -34,7 +34,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         status: int = arguments.run(arguments)
         sys.stdout.flush()
     except BrokenPipeError:
-        # The reader (`| head`) has gone. Python would complain about it once more at exit.
+        # The reader of a pipe (`| head`) has ended. Without this, Python would print an error at exit.
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except (InputError, OSError) as error:
@@ -52,6 +52,6 @@ def _build_parser() -> argparse.ArgumentParser:
     commands = parser.add_subparsers(title="commands", metavar="COMMAND", required=True)
     for command in (run, drift, frames, relations, simulate):
         command.add(commands)
-    for name, command in FULL.items():
+    for name, command in FULL_COMMANDS.items():
         command.add(commands) if is_full() else add_missing(commands, name)
     return parser

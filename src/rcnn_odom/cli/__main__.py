@@ -1,4 +1,4 @@
-"""``python -m rcnn_odom.cli``."""
+"""Runs the command line by ``python -m rcnn_odom.cli``."""
 
 import sys
 

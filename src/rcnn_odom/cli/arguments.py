@@ -1,4 +1,4 @@
-"""What the commands' arguments have in common."""
+"""Parsers of argument values that several commands use."""
 
 import argparse
 import math
@@ -9,11 +9,15 @@ from pathlib import Path
 from typing import TypeAlias
 
 Subcommands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
-"""What a command adds itself to."""
+"""Type of the object that a command adds its parser to."""
 
 
 def metres(text: str) -> float:
-    """A length above 0, for ``type=`` of an argument."""
+    """Parses a length above 0, for ``type=`` of an argument.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is something else.
+    """
     try:
         length = float(text)
     except ValueError:
@@ -24,7 +28,7 @@ def metres(text: str) -> float:
 
 
 def whole_number(least: int) -> Callable[[str], int]:
-    """A parser of whole numbers from ``least`` on, for ``type=`` of an argument."""
+    """Makes a parser of whole numbers of at least ``least``, for ``type=`` of an argument."""
 
     def parse(text: str) -> int:
         if not text.isdecimal() or int(text) < least:
@@ -35,7 +39,11 @@ def whole_number(least: int) -> Callable[[str], int]:
 
 
 def height(text: str) -> tuple[float, float]:
-    """Two heights in metres, ``-0.1:0.1``, for ``type=`` of an argument."""
+    """Parses two heights in metres, for instance ``-0.1:0.1``, for ``type=`` of an argument.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is something else, or the first height is not the lower one.
+    """
     try:
         low, high = map(float, text.split(":"))
     except ValueError:
@@ -46,7 +54,11 @@ def height(text: str) -> tuple[float, float]:
 
 
 def degrees(text: str) -> float:
-    """An angle above 0 and up to the circle, for ``type=`` of an argument."""
+    """Parses an angle in degrees, above 0 and at most 360, for ``type=`` of an argument.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is something else.
+    """
     try:
         angle = float(text)
     except ValueError:
@@ -57,7 +69,14 @@ def degrees(text: str) -> float:
 
 
 def laser_pose(text: str) -> tuple[float, float, float]:
-    """Metres, metres and degrees as x, y and heading in radians, for ``type=`` of an argument."""
+    """Parses a pose, ``0.2 0 -90`` in metres, metres and degrees, for ``type=`` of an argument.
+
+    Returns:
+        x and y in metres, and the heading in radians.
+
+    Raises:
+        argparse.ArgumentTypeError: the text is something else.
+    """
     try:
         x, y, heading = map(float, text.split())
     except ValueError:
@@ -70,7 +89,10 @@ def laser_pose(text: str) -> tuple[float, float, float]:
 
 
 def split_thinning(text: str) -> tuple[Path, int | None]:
-    """The path and the 3 of ``PATH[::3]``; None of a path alone, and where there is a file of that name."""
+    """Splits ``PATH[::3]``, every third scan of a recording, into the path and the number 3.
+
+    The number is None if the text has no such ending, or if it is the name of an existing file.
+    """
     match = re.fullmatch(r"(.+)\[::([1-9]\d*)\]", text)
     if match is None or Path(text).exists():
         return Path(text), None
@@ -78,11 +100,14 @@ def split_thinning(text: str) -> tuple[Path, int | None]:
 
 
 SIGNED = {"--height": 1, "--laser-pose": 3}
-"""Options whose values may begin with a minus, and how many values they have."""
+"""Options whose values may start with a minus sign, and the number of their values."""
 
 
 def join_signed(arguments: Sequence[str]) -> list[str]:
-    """``--height -0.1:0.1`` as ``--height=-0.1:0.1``: argparse takes the former's value for an option."""
+    """Joins options with their values if these may start with "-", which argparse would read as options.
+
+    ``--height -0.1:0.1`` becomes ``--height=-0.1:0.1``.
+    """
     joined, rest = list[str](), list(arguments)
     while rest:
         joined.append(rest.pop(0))

@@ -1,4 +1,4 @@
-"""`rcnn-odom drift`: a trajectory against the ground truth."""
+"""The command `rcnn-odom drift`: scores a trajectory against the ground truth."""
 
 import argparse
 import json
@@ -22,21 +22,21 @@ def add(commands: Subcommands) -> None:
     )
     parser.add_argument("truth", type=Path, metavar="GT.txt", help="ground truth")
     parser.add_argument("estimate", type=Path, metavar="EST.txt", help="estimate of the same frames")
-    parser.add_argument("--planar", action="store_true", help="flatten both to the x-z plane first")
+    parser.add_argument("--planar", action="store_true", help="project both on the x-z plane first")
     parser.add_argument(
         "--lengths",
         type=_parse_lengths,
         metavar="M,M,...",
-        help="segment lengths in metres (100,200,...,800)",
+        help="segment lengths in metres (default: 100,200,...,800)",
     )
     parser.add_argument(
         "--step",
         type=whole_number(1),
         default=10,
         metavar="N",
-        help="frames between segment starts (%(default)s)",
+        help="frames between the starts of segments (default: %(default)s)",
     )
-    parser.add_argument("--json", action="store_true", help="print JSON: ratios, degrees per metre")
+    parser.add_argument("--json", action="store_true", help="print JSON with ratios and degrees per metre")
     parser.set_defaults(run=_run_drift)
 
 
@@ -57,18 +57,18 @@ def _run_drift(arguments: argparse.Namespace) -> int:
     truth = flatten(truth) if arguments.planar else truth
     path = travelled(truth)[-1]
     missing = ", ".join(f"{length:g}" for length in lengths if length not in result.per_length)
-    nothing = f"no segment of {missing} m in a path of {path:.4g} m"
+    no_segments = f"no segment of {missing} m in a path of {path:.4g} m"
     if result.segments == 0:
         fitting = ",".join(f"{length:g}" for length in fitting_lengths([truth], lengths))
-        raise InputError(f"{nothing}: try --lengths {fitting}")
+        raise InputError(f"{no_segments}: try --lengths {fitting}")
     print(_format_drift(result, arguments.planar, arguments.step))
     if missing:
-        print(f"\n{nothing}")
+        print(f"\n{no_segments}")
     return 0
 
 
 def _format_drift(result: "Drift", planar: bool, step: int) -> str:
-    """A table for people: percent and degrees."""
+    """Formats the drift as text in percent and degrees."""
     assert result.t_err is not None
     assert result.t_rmse is not None
     assert result.r_err_deg_per_m is not None

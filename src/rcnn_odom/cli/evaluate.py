@@ -1,15 +1,15 @@
-"""`rcnn-odom evaluate`: scores a finished run again, or a model that does not train."""
+"""The command `rcnn-odom evaluate`: scores a finished run again, or a model without training."""
 
 import argparse
 
 from rcnn_odom.cli.arguments import Subcommands
-from rcnn_odom.cli.full import add_passing_on
+from rcnn_odom.cli.full import add_forwarding_command
 
 
 def add(commands: Subcommands) -> None:
     """Adds the command to ``rcnn-odom``."""
-    about = "score a run or a model again: evaluate run=outputs/latest; evaluate --help shows all"
-    add_passing_on(commands, "evaluate", _run_evaluate, about)
+    description = "score a run, or a model without training: evaluate run=outputs/latest; see evaluate --help"
+    add_forwarding_command(commands, "evaluate", _run_evaluate, description)
 
 
 def _run_evaluate(arguments: argparse.Namespace) -> int:

@@ -1,4 +1,4 @@
-"""`rcnn-odom export`: a checkpoint as one file for robots."""
+"""The command `rcnn-odom export`: writes a checkpoint as one ONNX file for robots."""
 
 import argparse
 import os
@@ -12,36 +12,41 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "export",
         help="write a trained network as an ONNX file",
-        description="Write the network of a run as one ONNX file: a pair of scans in, a step and its "
-        "covariance out, the network's state explicit, with the sensor and the encoding of scans in its "
-        "metadata. The file is compared with the checkpoint step by step, and the drift of each precision on "
-        "the run's test sequences is printed. int8 that costs more than 0.1 percentage points of drift is "
-        "not written.",
+        description="Write the network of a run as one ONNX file. Its input is a pair of scans and the "
+        "network's state; its output is a step with covariance and the next state. Its metadata contain the "
+        "sensor and the encoding of scans. The file is compared with the checkpoint step by step, and the "
+        "drift of each precision on the run's test sequences is printed. An int8 file is not written if it "
+        "increases the drift by more than 0.1 percentage points.",
     )
     parser.add_argument(
         "checkpoint", type=Path, metavar="CKPT", help="RUN/checkpoints/best.ckpt, or the run's folder"
     )
-    parser.add_argument("--format", choices=["onnx"], default="onnx", help="of the file (%(default)s)")
     parser.add_argument(
-        "--quantize", choices=["int8"], help="weights of the products in 8 bits: a quarter of the size"
+        "--format", choices=["onnx"], default="onnx", help="format of the file (default: %(default)s)"
+    )
+    parser.add_argument(
+        "--quantize",
+        choices=["int8"],
+        help="store the weights of matrix products in 8 bits, which quarters the file size",
     )
     parser.add_argument(
         "--out",
         type=Path,
         metavar="FILE",
-        help="to write (RUN/model.onnx or RUN/model_int8.onnx)",
+        help="file to write (default: RUN/model.onnx or RUN/model_int8.onnx)",
     )
     parser.add_argument(
         "--fit-on",
         nargs="+",
         metavar="NAME",
-        help="drives to fit the uncertainty of steps on anew, in place of the run's validation drives; more "
-        "of them know more. They must be neither trained nor tested on. The checkpoint keeps its own",
+        help="fit the covariance of steps on these drives, not on the run's validation drives; more drives "
+        "give a better fit. They must not be training or test drives. The checkpoint is not changed",
     )
     parser.add_argument(
         "--no-drift",
         action="store_true",
-        help="where the recordings are not at hand: compare with the checkpoint on random scans alone",
+        help="do not compute the drift, and compare with the checkpoint on random scans only; needs no "
+        "recordings",
     )
     parser.set_defaults(run=_run_export)
 

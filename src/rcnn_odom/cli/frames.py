@@ -1,4 +1,4 @@
-"""`rcnn-odom frames`: errors of a drive's single frames."""
+"""The command `rcnn-odom frames`: errors of the single frames of a drive."""
 
 import argparse
 import json
@@ -12,22 +12,24 @@ def add(commands: Subcommands) -> None:
     """Adds the command to ``rcnn-odom``."""
     parser = commands.add_parser(
         "frames",
-        help="errors of a drive's single frames",
-        description="Errors of distance and heading a frame, against the truth and against a smoothed true "
-        "distance (that of a GPS jitters), and of the end point of the motions put together.",
+        help="print the errors of the single frames of a drive",
+        description="Print the errors of distance and heading per frame against the ground truth, the errors "
+        "of distance against the smoothed true distance (without the jitter of a GPS), and the error of the "
+        "end point of the composed motions.",
     )
     parser.add_argument("motions", type=Path, metavar="MOTIONS.csv", help="RUN/trajectories/*_motions.csv")
     parser.add_argument(
         "--frames",
         type=_parse_frames,
         metavar="FIRST:LAST",
-        help="only these, both included, such as 20:39; a frame is the motion to the scan of its number",
+        help="only these frames, first and last included, for instance 20:39; frame n is the motion from "
+        "scan n-1 to scan n",
     )
     parser.add_argument(
         "--apply",
         choices=["start", "middle", "end"],
         default="end",
-        help="where along its turn a step is taken (%(default)s)",
+        help="where along its turn a step is applied (default: %(default)s)",
     )
     parser.add_argument("--json", action="store_true", help="print JSON; end_ratio is a ratio, not percent")
     parser.set_defaults(run=_run_frames)
@@ -50,7 +52,7 @@ def _run_frames(arguments: argparse.Namespace) -> int:
     first, last = arguments.frames or (1, len(truth))
     if first < 1 or last > len(truth):
         raise InputError(
-            f"{arguments.motions}: --frames {first}:{last} reaches outside of the drive, "
+            f"{arguments.motions}: --frames {first}:{last} is outside of the drive, "
             f"which has {len(truth)} frames: 1:{len(truth)}"
         )
     chosen = slice(first - 1, last)

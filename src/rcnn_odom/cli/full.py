@@ -1,4 +1,4 @@
-"""The commands that ``rcnn-odom-robot``, the distribution without training, does not have."""
+"""Commands that need the full distribution; ``rcnn-odom-robot`` has no training and does not contain them."""
 
 import argparse
 from collections.abc import Callable
@@ -10,47 +10,51 @@ from rcnn_odom.errors import InputError
 
 
 def is_full() -> bool:
-    """Whether training is installed, and with it PyTorch, Lightning and Hydra."""
+    """Whether the full distribution is installed: training, PyTorch, Lightning and Hydra."""
     found = find_spec("rcnn_odom.training")
-    # A folder without code is what an uninstalled distribution has left behind.
+    # Without an origin it is an empty folder that an uninstalled distribution left behind.
     return found is not None and found.origin is not None
 
 
 def need_full(what: str) -> None:
-    """Says what to install where something needs all of the project.
+    """Checks that the full distribution is installed.
 
     Args:
-        what: is wanted, the beginning of the sentence.
+        what: what needs it, the subject of the error message.
 
     Raises:
-        InputError: only the robot's part is installed.
+        InputError: only ``rcnn-odom-robot`` is installed; the message says what to install.
     """
     if not is_full():
-        raise InputError(f"{what} needs more than rcnn-odom-robot has: pip install rcnn-odom")
+        raise InputError(
+            f"{what} needs the full distribution, not only rcnn-odom-robot: pip install rcnn-odom"
+        )
 
 
 def add_missing(commands: Subcommands, name: str) -> None:
-    """Adds a command that only says what to install, whatever its arguments."""
-    add_passing_on(commands, name, partial(_refuse, name), "needs more: pip install rcnn-odom")
+    """Adds a command that accepts any arguments and only raises the error that says what to install."""
+    add_forwarding_command(
+        commands, name, partial(_raise_missing, name), "needs the full distribution: pip install rcnn-odom"
+    )
 
 
-def _refuse(name: str, _: argparse.Namespace) -> int:
+def _raise_missing(name: str, _: argparse.Namespace) -> int:
     need_full(f"rcnn-odom {name}")
-    raise AssertionError("a command that is there was said to be missing")
+    raise AssertionError("the full distribution is installed, but the command was added as missing")
 
 
-def add_passing_on(
-    commands: Subcommands, name: str, run: Callable[[argparse.Namespace], int], about: str
+def add_forwarding_command(
+    commands: Subcommands, name: str, run: Callable[[argparse.Namespace], int], description: str
 ) -> None:
-    """Adds a command whose ``arguments`` all go on as they are, ``--help`` among them.
+    """Adds a command that forwards all its arguments unchanged, including ``--help``.
 
     Args:
-        commands: of ``rcnn-odom``.
-        name: of the command.
-        run: gets the arguments; the exit status.
-        about: one line of help.
+        commands: the commands of ``rcnn-odom``.
+        name: name of the command.
+        run: function that gets the forwarded texts as ``arguments`` and returns the exit status.
+        description: one line of help.
     """
-    # No argument begins with this character, so that argparse takes none for an option.
-    parser = commands.add_parser(name, help=about, add_help=False, prefix_chars="\0")
+    # No argument starts with this character, so argparse reads none of them as an option.
+    parser = commands.add_parser(name, help=description, add_help=False, prefix_chars="\0")
     parser.add_argument("arguments", nargs="*")
     parser.set_defaults(run=run)

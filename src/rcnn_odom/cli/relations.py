@@ -1,4 +1,4 @@
-"""`rcnn-odom relations`: a trajectory against hand-verified relations between scans."""
+"""The command `rcnn-odom relations`: scores a trajectory against hand-verified relations between scans."""
 
 import argparse
 import json
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 TUM_COLUMNS = 8
 LOOP_PATH = 5.0
-"""Metres, as in :mod:`rcnn_odom.evaluation.relations`, which would slow ``--help`` down."""
+"""The same as in :mod:`rcnn_odom.evaluation.relations`, whose import would make ``--help`` slow."""
 
 
 def add(commands: Subcommands) -> None:
@@ -25,32 +25,33 @@ def add(commands: Subcommands) -> None:
         "relations",
         help="score a trajectory against hand-verified relations between scans",
         description="Score a trajectory against hand-verified relative poses between scans of a CARMEN log "
-        "(Kuemmerle et al. 2009). Sequential relations, from one place to the next, and loops are separated "
-        "by the way between their scans, along the log's wheel odometry.",
+        "(Kuemmerle et al. 2009). Sequential relations and loop closures are scored separately; they differ "
+        "by the path length between their scans, which is measured with the wheel odometry of the log.",
     )
     add = parser.add_argument
-    add("log", type=Path, metavar="LOG", help="CARMEN log; plain, .gz or .bz2")
+    add("log", type=Path, metavar="LOG", help="CARMEN log, also packed as .gz or .bz2")
     add(
         "estimate",
         type=Path,
         metavar="EST",
-        help="RUN/trajectories/NAME.txt (KITTI: 12 numbers a line, one for each scan of LOG), or NAME.tum "
-        "(stamp x y z qx qy qz qw, also of a part of LOG, found by the stamps)",
+        help="RUN/trajectories/NAME.txt (KITTI's format: 12 numbers a line, one line for each scan of LOG) "
+        "or NAME.tum (stamp x y z qx qy qz qw; may be a part of LOG, whose scans are found by the stamps)",
     )
     add("relations", type=Path, metavar="RELATIONS", help="lines of t1 t2 x y z roll pitch yaw")
     add(
         "--frame",
         choices=["camera", "laser"],
         default="camera",
-        help="whose poses EST holds: camera (x right, z forward), as runs write them, or laser (x forward, "
-        "y left), as many other programs do (%(default)s)",
+        help="frame of the poses in EST: camera (x right, z forward), as runs write them, or laser (x "
+        "forward, y left), as many other programs write them (default: %(default)s)",
     )
     add(
         "--loop-path",
         type=metres,
         metavar="M",
         default=LOOP_PATH,
-        help="a relation closes a loop if the robot drove more metres between its scans (%(default)s)",
+        help="a relation closes a loop if the robot drove more than M metres between its scans (default: "
+        "%(default)s)",
     )
     add("--json", action="store_true", help="print JSON")
     parser.set_defaults(run=_run_relations)
@@ -65,7 +66,7 @@ def _run_relations(arguments: argparse.Namespace) -> int:
     from rcnn_odom.recordings import carmen
 
     if not arguments.log.is_file():
-        raise InputError(f"{arguments.log}: no such file; give the log that the relations are of")
+        raise InputError(f"{arguments.log}: no such file; give the log to which the relations belong")
     relations = read_relations(arguments.relations)
     log = carmen.load(arguments.log.name, root=arguments.log.parent)
     stamps = stamp_keys(log.stamps)
@@ -80,7 +81,19 @@ def _run_relations(arguments: argparse.Namespace) -> int:
 
 
 def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "FloatArray":
-    """Poses (N, 4, 4) for all stamps (N,) of the log, nan where the file has none."""
+    """Reads the poses of the estimate.
+
+    Args:
+        path: file in KITTI's or TUM's format.
+        log: the log, for error messages.
+        stamps: (N,) stamps of all scans of the log, see :func:`rcnn_odom.evaluation.relations.stamp_keys`.
+
+    Returns:
+        Poses (N, 4, 4), nan for a scan without a pose in the file.
+
+    Raises:
+        InputError: the file cannot be read, or does not fit the log.
+    """
     import numpy as np
 
     from rcnn_odom.evaluation.relations import stamp_keys
@@ -90,8 +103,8 @@ def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "Floa
         poses = read_kitti(path)
         if len(poses) != len(stamps):
             raise InputError(
-                f"{path}: {len(poses)} poses, but {log} has {len(stamps)} scans; of a part of a log give the "
-                "file NAME.tum, whose stamps say which"
+                f"{path}: {len(poses)} poses, but {log} has {len(stamps)} scans; for a part of a log, give "
+                "the file NAME.tum, which has the stamps"
             )
         return poses
     times, poses = read_tum(path)
@@ -100,7 +113,7 @@ def _read_poses(path: Path, log: Path, stamps: "npt.NDArray[np.int64]") -> "Floa
     for line, (stamp, pose) in enumerate(zip(stamp_keys(times).tolist(), poses, strict=True), start=1):
         if stamp not in numbers:
             raise InputError(
-                f"{path}:{line}: no scan of {log} has the stamp {stamp / 1e6:.6f}; give its own log"
+                f"{path}:{line}: no scan of {log} has the stamp {stamp / 1e6:.6f}; give the log of EST"
             )
         every[numbers[stamp]] = pose
     return every
@@ -115,7 +128,7 @@ def _count_columns(path: Path) -> int:
 
 
 def _format(report: dict[str, Any]) -> str:
-    """A table for people."""
+    """Formats the errors as a text table."""
     lines = [f"{'relations':<12}{'count':>7}   {'translation (m)':^17}   {'rotation (deg)':^17}"]
     lines.append(f"{'':<12}{'':>7}   {'mean':>8} {'median':>8}   {'mean':>8} {'median':>8}")
     for name in ("sequential", "loop", "all"):

@@ -1,4 +1,4 @@
-"""`rcnn-odom report`: what differs between the runs of a sweep."""
+"""The command `rcnn-odom report`: compares the runs of a sweep."""
 
 import argparse
 import json
@@ -13,33 +13,33 @@ def add(commands: Subcommands) -> None:
     parser = commands.add_parser(
         "report",
         help="compare the runs of a sweep: tables, differences with intervals, figures",
-        description="Writes report.md, report.html and report_figures into a folder of runs: drift and "
-        "other metrics by setting over seeds, which differences are shown and which are not, the paper's "
-        "figures, curves, trajectories, times and commands. Runs that are not finished are named, and in "
-        "no mean.",
+        description="Write report.md, report.html and report_figures into a folder of runs. The report "
+        "contains the drift and other metrics of each setting over seeds, tests of the differences between "
+        "settings, the results of the paper, figures, training times and commands. Unfinished runs are "
+        "listed and left out of all means.",
     )
     parser.add_argument(
-        "directory", type=Path, metavar="DIR", help="outputs/SWEEP, or any folder around runs"
+        "directory", type=Path, metavar="DIR", help="outputs/SWEEP, or any folder that contains runs"
     )
     parser.add_argument(
         "--only",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="take only runs with this option, such as data.scale=full; can be repeated",
+        help="take only runs with this value, for instance data.scale=full; can be repeated",
     )
     parser.add_argument(
         "--reference",
         action="append",
         default=[],
         metavar="KEY=VALUE",
-        help="compare with this setting, such as model.kernel_size=3; can be repeated (without it: the "
-        "paper's choice, else the first)",
+        help="compare the others with this setting, for instance model.kernel_size=3; can be repeated "
+        "(default: the setting of the paper, otherwise the first)",
     )
     parser.add_argument(
         "--json",
         action="store_true",
-        help="print the runs and the comparisons as JSON; the files are written as well",
+        help="print the runs and the comparisons as JSON; the files are also written",
     )
     parser.set_defaults(run=_run_report)
 
@@ -55,6 +55,8 @@ def _run_report(arguments: argparse.Namespace) -> int:
         return 0
     print(f"{written.table}\n")
     if written.unfinished:
-        print(f"not finished, and in no mean: {written.unfinished}; the report begins with their list\n")
+        print(
+            f"runs that did not finish: {written.unfinished}; the report lists them, no mean contains them\n"
+        )
     print(f"{shlex.quote(str(written.markdown))}\n{shlex.quote(str(written.html))}")
     return 0

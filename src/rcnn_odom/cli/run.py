@@ -1,4 +1,4 @@
-"""`rcnn-odom run`: poses from a recording or a live laser."""
+"""The command `rcnn-odom run`: estimates poses from a recording or a live laser."""
 
 import argparse
 import io
@@ -30,52 +30,52 @@ if TYPE_CHECKING:
     from rcnn_odom.models.contract import ScanTracker
     from rcnn_odom.recordings.stream import ScanStream
 
-MATCHER, FUSED, OLD_NAME = "matcher", "fused", "icp"
+MATCHER, FUSED, OLD_MATCHER_NAME = "matcher", "fused", "icp"
 FORMAT_OPTIONS = ("topic", "ring", "height", "field_of_view_deg", "base", "odom_topic")
-"""Options that are a format's own."""
-FILE_OPTIONS = (*FORMAT_OPTIONS[1:], "wheels")
-"""Those of recordings alone."""
+"""Options of the recording formats."""
+RECORDING_OPTIONS = (*FORMAT_OPTIONS[1:], "wheels")
+"""Options that do not work with ``--live``."""
 WHEEL_OPTIONS, MATCHER_OPTIONS, NETWORK_OPTIONS = ("wheels", "odom_topic"), ("deskew",), ("threads",)
-"""Those that only scan matching alone has, those that scan matching has, and those that a network has."""
-FIRST_SCANS = 100
-"""In which the wheels must have been heard of."""
+"""Options that work with the matcher only, with the matcher and with ``--model fused``, and with networks."""
+WHEEL_CHECK_SCANS = 100
+"""Number of first scans among which one must have wheel odometry, if an option asks for it."""
 
 
 def add(commands: Subcommands) -> None:
     """Adds the command to ``rcnn-odom``."""
     parser = commands.add_parser(
         "run",
-        help="poses from a recording or a live laser",
-        description="Estimate the trajectory of any 2D laser by scan matching, or with --model by a trained "
-        "network, from a recording: a folder of a KITTI sequence or of a KITTI raw "
+        help="estimate poses from a recording or a live laser",
+        description="Estimate the trajectory of any 2D laser from a recording, by scan matching or (with "
+        "--model) by a trained network. The recording is the folder of a KITTI sequence or of a KITTI raw "
         "drive, a CARMEN log, a ROS bag with LaserScan or PointCloud2 messages (ROS 1, ROS 2 sqlite3 or "
-        "mcap; no ROS needed), or a file of JSON lines; packed ones too. Writes trajectory.txt "
-        "(KITTI), trajectory.tum, steps.jsonl (each step with its uncertainty), summary.json and "
-        "report.html, which is made to be looked at. "
-        "With --live: scans as JSON lines from standard input, such as "
-        '{"stamp": 1.0, "ranges": [2.5, ...], "angle_min": -3.14, "angle_increment": 0.0031}, and a pose '
-        "for each on standard output.",
+        "mcap; no ROS needed), or a file of JSON lines; it may be packed. The command writes trajectory.txt "
+        "(KITTI's format), trajectory.tum, steps.jsonl (each step with its covariance), summary.json and "
+        "report.html, a page with figures. "
+        "With --live it reads scans as JSON lines from standard input, for instance "
+        '{"stamp": 1.0, "ranges": [2.5, ...], "angle_min": -3.14, "angle_increment": 0.0031}, and writes a '
+        "pose for each scan to standard output.",
     )
     add = parser.add_argument
     add("paths", nargs="*", metavar="INPUT", help="the recording; INPUT[::3] takes every third scan of it")
-    add("--out", type=Path, metavar="DIR", help="folder to write to; must not hold a trajectory yet")
+    add("--out", type=Path, metavar="DIR", help="folder to write to; it must not contain a trajectory")
     add("--live", action="store_true", help="read scans from standard input, write poses to standard output")
     add(
         "--model",
         metavar="MODEL",
-        help="matcher (scan matching, the default), an exported .onnx, a .ckpt, or all_round or "
-        "half_circle, which ship along; or fused: scan matching with a network's steps as its priors",
+        help="matcher (scan matching, the default), an exported .onnx, a .ckpt, one of the included networks "
+        "all_round and half_circle, or fused (scan matching with the steps of a network as priors)",
     )
     add(
         "--network",
         metavar="NETWORK",
-        help="of --model fused: an exported .onnx, a network that ships along (all_round), or held",
+        help="network of --model fused: an exported .onnx, an included network (default: all_round), or held",
     )
-    add("--every", type=whole_number(1), metavar="N", help="take every N-th scan only")
+    add("--every", type=whole_number(1), metavar="N", help="use only every N-th scan")
     _add_outputs(parser)
     _add_poses_and_priors(parser)
     _add_format_options(parser)
-    add("--threads", type=whole_number(1), metavar="N", help="of a network's computation (1)")
+    add("--threads", type=whole_number(1), metavar="N", help="number of threads of a network (default: 1)")
     parser.set_defaults(run=lambda arguments: _run(parser, arguments))
 
 
@@ -85,11 +85,16 @@ def _add_outputs(parser: argparse.ArgumentParser) -> None:
         "--mcap",
         type=Path,
         metavar="FILE.mcap",
-        help="write odometry, path, scans, local map and transforms as messages of ROS 2, for Foxglove or "
-        "ros2 bag",
+        help="write odometry, path, scans, local map and transforms as ROS 2 messages, for Foxglove or ros2 "
+        "bag",
     )
-    add("--rerun", type=Path, metavar="FILE.rrd", help="write the same for rerun's viewer (the extra view)")
-    add("--view", action="store_true", help="open rerun's viewer while the run goes (the extra view)")
+    add(
+        "--rerun",
+        type=Path,
+        metavar="FILE.rrd",
+        help="write the same for the viewer of rerun (needs the extra view)",
+    )
+    add("--view", action="store_true", help="show the run live in the viewer of rerun (needs the extra view)")
 
 
 def _add_poses_and_priors(parser: argparse.ArgumentParser) -> None:
@@ -98,34 +103,53 @@ def _add_poses_and_priors(parser: argparse.ArgumentParser) -> None:
         "--laser-pose",
         type=laser_pose,
         metavar="X Y HEADING",
-        help="where the laser sits on the robot, upright, in metres, metres and degrees: gives the robot's "
-        "poses",
+        help="pose of the upright laser on the robot in metres, metres and degrees; the output is then the "
+        "poses of the robot",
     )
-    add("--base", metavar="FRAME", help="the robot's frame, base_link: its poses, by a bag's /tf_static")
-    add("--wheels", action="store_true", help="the odometry in a log helps the matcher")
-    add("--odom-topic", metavar="TOPIC", help="the odometry of this topic of a bag helps the matcher")
+    add(
+        "--base",
+        metavar="FRAME",
+        help="frame of the robot, for instance base_link; the output is then its poses, "
+        "with the transforms in /tf_static of a bag",
+    )
+    add("--wheels", action="store_true", help="use the odometry in a log as the prior of the matcher")
+    add(
+        "--odom-topic",
+        metavar="TOPIC",
+        help="use the odometry on this topic of a bag as the prior of the matcher",
+    )
     add(
         "--deskew",
         choices=("auto", "on", "off"),
-        help="take the motion within a scan out of it (auto: on unless the recording has done it)",
+        help="remove the distortion of scans by the motion (auto: on unless it is removed already)",
     )
 
 
 def _add_format_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
-    add("--topic", help="of the messages in a bag, or in JSON lines of rosbridge, that has several")
-    add("--ring", type=whole_number(0), metavar="N", help="of KITTI or a point cloud (the most level one)")
-    add("--height", type=height, metavar="LOW:HIGH", help="metres: cuts a slice of a point cloud, not a ring")
+    add("--topic", help="topic of the scans, if a bag or JSON lines of rosbridge have several")
+    add(
+        "--ring",
+        type=whole_number(0),
+        metavar="N",
+        help="ring of KITTI or of a point cloud (default: the most level one)",
+    )
+    add(
+        "--height",
+        type=height,
+        metavar="LOW:HIGH",
+        help="take the points between two heights in metres of a point cloud, not a ring",
+    )
     add(
         "--field-of-view-deg",
         type=degrees,
         metavar="DEG",
-        help="that the beams of a CARMEN log's FLASER lines cover (what the log says, or 180)",
+        help="field of view of the FLASER lines of a CARMEN log (default: that in the log, or 180)",
     )
 
 
 def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
-    _check(parser, arguments)
+    _check_arguments(parser, arguments)
     outputs = _make_outputs(arguments)
     from rcnn_odom.deployment.odometer import Odometer
     from rcnn_odom.deployment.run import PAGE, run
@@ -134,7 +158,7 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
     logging.basicConfig(format="%(message)s", level=logging.INFO, stream=sys.stderr)
     model = arguments.model or MATCHER
     network = None if model in (MATCHER, FUSED) else _load_network(model, arguments.threads or 1)
-    stream = _open(parser, arguments)
+    stream = _open_stream(parser, arguments)
     odometer = Odometer(
         network or _build_matcher(arguments, stream), arguments.laser_pose or stream.laser_pose
     )
@@ -142,19 +166,19 @@ def _run(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> int:
         for note in stream.notes:
             print(f"{stream.name}: {note}")
     on_pose = _print_pose if arguments.live else None
-    name, settings = Path(model).stem, _settings(arguments)
+    name, settings = Path(model).stem, _given_options(arguments)
     summary = run(odometer, stream, name, arguments.out, on_pose, settings, outputs)
     page = arguments.out / PAGE if arguments.out else None
-    # What answers a live laser is poses alone.
+    # With --live, standard output contains only poses.
     print(format_lines(summary, page), file=sys.stderr if arguments.live else sys.stdout)
     return 0
 
 
 def _make_outputs(arguments: argparse.Namespace) -> "list[Output]":
-    """What takes the poses beside the folder; each says at once whether it can.
+    """Creates the outputs other than the folder: files for mcap and rerun, and the viewer.
 
     Raises:
-        InputError: one cannot.
+        InputError: an output cannot be created.
     """
     outputs: list[Output] = []
     if arguments.mcap:
@@ -172,52 +196,58 @@ def _make_outputs(arguments: argparse.Namespace) -> "list[Output]":
     return outputs
 
 
-def _settings(arguments: argparse.Namespace) -> dict[str, str]:
-    """The options that were given, for the report."""
+def _given_options(arguments: argparse.Namespace) -> dict[str, str]:
+    """The options that the user gave, as texts by name, for the report."""
     given = {
-        _option(name): " ".join(_as_words(name, value)) or "yes"
+        _option_name(name): " ".join(_format_value(name, value)) or "yes"
         for name, value in vars(arguments).items()
         if name not in ("paths", "out", "run") and value not in (None, False)
     }
     return {"INPUT": " ".join(arguments.paths), **given} if arguments.paths else given
 
 
-def _check(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
-    """Refuses what does not go together.
+def _check_arguments(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> None:
+    """Checks that the options can be combined; ends the process with a usage error if not.
 
     Raises:
-        InputError: the model comes before the recording, or has the name, that it had in earlier versions.
+        InputError: the model is given before the recording or under its old name, as in earlier versions.
     """
     _refuse_old_order(arguments)
-    if arguments.model == OLD_NAME:
-        raise InputError(f"--model {OLD_NAME} has become --model {MATCHER}, the default; leave --model out")
+    if arguments.model == OLD_MATCHER_NAME:
+        raise InputError(
+            f"--model {OLD_MATCHER_NAME} is now --model {MATCHER}, the default; leave out --model"
+        )
     if len(arguments.paths) != (0 if arguments.live else 1):
         parser.error("give one INPUT or --live")
     if not (arguments.live or arguments.out or arguments.mcap or arguments.rerun or arguments.view):
         parser.error("--out DIR is needed, or --mcap, --rerun or --view")
     if arguments.base and arguments.laser_pose:
-        parser.error("--base and --laser-pose say the same; give one of them")
+        parser.error("--base and --laser-pose both set the pose of the laser; give only one of them")
     if arguments.wheels and arguments.odom_topic:
-        parser.error("--wheels and --odom-topic are two odometries; give one of them")
+        parser.error("--wheels and --odom-topic choose different odometry; give only one of them")
     is_matcher, is_fused = arguments.model in (None, MATCHER), arguments.model == FUSED
-    for names, is_refused, why in (
-        (FILE_OPTIONS, arguments.live, "is of recordings, not of --live"),
-        (WHEEL_OPTIONS, is_fused, "is of the matcher alone, not of --model fused, whose prior is a network"),
-        (("network",), not is_fused, "is of --model fused"),
+    for names, is_refused, reason in (
+        (RECORDING_OPTIONS, arguments.live, "works only with recordings, not with --live"),
+        (WHEEL_OPTIONS, is_fused, "works only with the matcher; the prior of --model fused is a network"),
+        (("network",), not is_fused, "works only with --model fused"),
         (
             WHEEL_OPTIONS + MATCHER_OPTIONS,
             not (is_matcher or is_fused),
-            "is of the matcher, not of a network",
+            "works only with the matcher, not with a network",
         ),
-        (NETWORK_OPTIONS, is_matcher, "is of a network (--model), not of the matcher"),
+        (NETWORK_OPTIONS, is_matcher, "works only with a network (--model), not with the matcher"),
     ):
         for name in names:
             if is_refused and getattr(arguments, name) not in (None, False):
-                parser.error(f"{_option(name)} {why}")
+                parser.error(f"{_option_name(name)} {reason}")
 
 
 def _refuse_old_order(arguments: argparse.Namespace) -> None:
-    """Answers ``run MODEL INPUT`` and ``run MODEL --live`` with what they have become."""
+    """Refuses ``run MODEL INPUT`` and ``run MODEL --live`` of earlier versions.
+
+    Raises:
+        InputError: with the command of this version.
+    """
     paths = arguments.paths
     if arguments.model or len(paths) != (1 if arguments.live else 2):
         return
@@ -229,16 +259,16 @@ def _refuse_old_order(arguments: argparse.Namespace) -> None:
     words = ["rcnn-odom", "run", *paths[1:], "--model", model]
     for name, value in vars(arguments).items():
         if name not in ("paths", "model", "run") and value not in (None, False):
-            words += [_option(name), *_as_words(name, value)]
+            words += [_option_name(name), *_format_value(name, value)]
     raise InputError(f"the recording comes first, and the model is an option: {shlex.join(words)}")
 
 
-def _option(name: str) -> str:
+def _option_name(name: str) -> str:
     return f"--{name.replace('_', '-')}"
 
 
-def _as_words(name: str, value: Any) -> list[str]:
-    """An option's value as it is written on the command line."""
+def _format_value(name: str, value: Any) -> list[str]:
+    """Formats the value of an option as the words of the command line."""
     if name == "laser_pose":
         x, y, heading = value
         return [f"{x:g}", f"{y:g}", f"{math.degrees(heading):g}"]
@@ -247,50 +277,50 @@ def _as_words(name: str, value: Any) -> list[str]:
     return [] if value is True else [str(value)]
 
 
-def _open(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> "ScanStream":
-    """The scans that are asked for.
+def _open_stream(parser: argparse.ArgumentParser, arguments: argparse.Namespace) -> "ScanStream":
+    """Opens the scans of the recording or of standard input.
 
     Raises:
-        InputError: there is no such recording, or it lacks what an option asks for.
+        InputError: there is no such recording, or it lacks data that an option needs.
     """
     from rcnn_odom.recordings import json_lines
     from rcnn_odom.recordings.formats import open_stream
     from rcnn_odom.recordings.stream import thin
 
     if arguments.live:
-        stream = _assume_turns(arguments, json_lines.stream_lines(_read_live(), topic=arguments.topic))
+        stream = _assume_even_turns(arguments, json_lines.stream_lines(_read_live(), topic=arguments.topic))
         return thin(stream, arguments.every or 1)
     path, every = split_thinning(arguments.paths[0])
     if every and arguments.every:
-        parser.error(f"--every and [::{every}] say the same; give one of them")
+        parser.error(f"--every and [::{every}] have the same meaning; give only one of them")
     options = {name: getattr(arguments, name) for name in FORMAT_OPTIONS}
     if arguments.odom_topic:
-        options["laser_pose"] = arguments.laser_pose  # by which the odometry is carried over to the laser
-    stream = _assume_turns(arguments, open_stream(path, options))
+        options["laser_pose"] = arguments.laser_pose  # It transforms the odometry to the laser.
+    stream = _assume_even_turns(arguments, open_stream(path, options))
     if arguments.wheels or arguments.odom_topic:
-        stream = _need_wheels(stream, "--wheels" if arguments.wheels else "--odom-topic")
+        stream = _check_wheel_odometry(stream, "--wheels" if arguments.wheels else "--odom-topic")
     return thin(stream, every or arguments.every or 1)
 
 
-def _assume_turns(arguments: argparse.Namespace, stream: "ScanStream") -> "ScanStream":
-    """With ``--deskew on`` also beams have times of which only the time of a turn is known."""
+def _assume_even_turns(arguments: argparse.Namespace, stream: "ScanStream") -> "ScanStream":
+    """With ``--deskew on``, computes the times of the beams if only the time of a whole turn is known."""
     from rcnn_odom.recordings.laser_scan import assume_even_turn
 
     return replace(stream, scans=map(assume_even_turn, stream.scans)) if arguments.deskew == "on" else stream
 
 
-def _need_wheels(stream: "ScanStream", option: str) -> "ScanStream":
-    """The same stream, after a look whether its first scans come with the robot's own odometry.
+def _check_wheel_odometry(stream: "ScanStream", option: str) -> "ScanStream":
+    """Checks that one of the first scans has wheel odometry; returns the same stream with all its scans.
 
     Raises:
-        InputError: they do not.
+        InputError: none of them has.
     """
-    first = list(islice(stream.scans, FIRST_SCANS))
+    first = list(islice(stream.scans, WHEEL_CHECK_SCANS))
     if first and not any(scan.wheel_pose for scan in first):
-        advice = f"leave {option} out" + (
-            "; of a bag, name its topic: --odom-topic" if option == "--wheels" else ""
+        advice = f"leave out {option}" + (
+            "; for a bag, name its topic with --odom-topic" if option == "--wheels" else ""
         )
-        raise InputError(f"{stream.name}: has no odometry of the robot with its scans; {advice}")
+        raise InputError(f"{stream.name}: its scans have no wheel odometry; {advice}")
     return replace(stream, scans=chain(first, stream.scans))
 
 
@@ -298,12 +328,12 @@ def _read_live() -> Iterable[str]:
     """The lines of standard input.
 
     Raises:
-        InputError: there is none.
+        InputError: standard input is closed.
     """
     if sys.stdin is None:
         raise InputError("standard input is closed; --live reads scans from it")
     if isinstance(sys.stdin, io.TextIOWrapper):
-        # Bytes that are no text are a line that is no scan.
+        # Invalid bytes are replaced, so that their line is skipped because it is not a scan.
         sys.stdin.reconfigure(encoding="utf-8", errors="replace")
     return sys.stdin
 

@@ -1,15 +1,15 @@
-"""`rcnn-odom train`: trains and scores one model."""
+"""The command `rcnn-odom train`: trains and scores one model."""
 
 import argparse
 
 from rcnn_odom.cli.arguments import Subcommands
-from rcnn_odom.cli.full import add_passing_on
+from rcnn_odom.cli.full import add_forwarding_command
 
 
 def add(commands: Subcommands) -> None:
     """Adds the command to ``rcnn-odom``."""
-    about = "train and score a model: train model=rcnn_reg data=kitti data.root=DIR; train --help shows all"
-    add_passing_on(commands, "train", _run_train, about)
+    description = "train and score a model: train model=rcnn_reg data=kitti data.root=DIR; see train --help"
+    add_forwarding_command(commands, "train", _run_train, description)
 
 
 def _run_train(arguments: argparse.Namespace) -> int:

@@ -1,1 +1,1 @@
-"""From steps to numbers and pictures."""
+"""Turns estimated steps into scores, figures and reports."""

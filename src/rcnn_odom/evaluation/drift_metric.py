@@ -14,16 +14,16 @@ from rcnn_odom.geometry import FloatArray
 
 
 class DriftMetric(Metric):
-    """Mean drift of whole sequences, each sent by one `update`; calls `drift.segment_errors`.
+    """Mean drift of whole sequences, by `drift.segment_errors`. Each call of `update` adds one sequence.
 
-    The states are sums for each name, in an order that is fixed at construction, so processes may
-    see different numbers of sequences, or none. A sequence that was sent before on the same process
-    is ignored. One that two processes send counts once too, if both estimates agree: its errors and its
-    number of segments double alike, and the mean stays.
+    The state has one sum for each sequence name, in an order that is fixed at construction. Processes may
+    therefore see different numbers of sequences, or none. A sequence that is added again in the same process
+    is ignored. If two processes add the same sequence with the same estimate, the sum of its errors and its
+    number of segments both double, so that the mean does not change.
 
     Args:
-        names: all sequences that may be sent, the same on every process.
-        planar: flatten to the x-z plane first, see `drift.drift`.
+        names: names of all sequences that may be added, the same on every process.
+        planar: project on the x-z plane first, see `drift.drift`.
         lengths: segment lengths in metres.
         step: frames between the starts of segments.
 
@@ -33,7 +33,7 @@ class DriftMetric(Metric):
 
     is_differentiable = False
     higher_is_better = False
-    # With True, `forward` updates the accumulated state itself, so that repeats are seen there too.
+    # With True, `forward` updates the accumulated state itself, so that it also ignores repeated sequences.
     full_state_update = True
 
     t_err_sum: torch.Tensor
@@ -61,16 +61,16 @@ class DriftMetric(Metric):
     def update(
         self, truth: torch.Tensor | npt.ArrayLike, estimate: torch.Tensor | npt.ArrayLike, name: str
     ) -> None:
-        """Add one whole sequence.
+        """Adds one whole sequence.
 
         Args:
             truth: ground truth (N, 4, 4), camera frame, metres; a tensor on any device, or an array.
             estimate: estimate of the same frames, (N, 4, 4).
-            name: which sequence it is.
+            name: name of the sequence.
 
         Raises:
             ValueError: the name was not given at construction.
-            InputError: bad poses, see `drift.segment_errors`.
+            InputError: the poses are invalid, see `drift.segment_errors`.
         """
         if name not in self.names:
             raise ValueError(f"unknown sequence {name!r}: this metric was built for {self.names}")
@@ -85,11 +85,11 @@ class DriftMetric(Metric):
         self.count[index] += len(errors.t_err)
 
     def compute(self) -> dict[str, torch.Tensor]:
-        """Drift of each sequence, and the mean over sequences, which all have the same weight.
+        """Drift of each sequence, and the mean over sequences with equal weights.
 
         Returns:
             ``drift`` and ``drift/NAME`` (ratios), ``r_err_deg_per_m`` and ``r_err_deg_per_m/NAME``.
-            Sequences without a segment are left out; without any sequence the dict is empty.
+            Sequences without a segment are left out; if there is no sequence, the dict is empty.
         """
         scored = torch.nonzero(self.count).flatten().tolist()
         result = {}
@@ -101,8 +101,8 @@ class DriftMetric(Metric):
         return result
 
     def _apply(self, fn: Callable[[torch.Tensor], torch.Tensor], *args: Any, **kwargs: Any) -> Module:
-        # torchmetrics guards against `.half()` but not against `.to(dtype)`, which a trainer in true
-        # half precision calls: counts of segments above 256 would be rounded.
+        # Keeps the dtype of the state. torchmetrics ignores `.half()` but not `.to(dtype)`, which a trainer
+        # in true half precision calls; it would round numbers of segments above 256.
         return super()._apply(lambda tensor: tensor.to(fn(tensor).device), *args, **kwargs)
 
 

@@ -1,4 +1,4 @@
-"""The figures of the paper: trajectories, and the motion of each frame."""
+"""Figures: the trajectories and frame motions of the paper, coverage of errors, and a map of scans."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -12,15 +12,20 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 TRUTH, ESTIMATE = "tab:blue", "tab:red"
-"""The paper's colours."""
+"""The colours of the paper's figures."""
 PATH_COLOURS = ("#3b1fa8", "#0a7fd0", "#009e73", "#e08a00", "#c8102e")
-"""Of a path from its start to its end; none is pale on white, and no two are alike in print."""
-NUMBERS_ON_PATH = 7
-"""Times that are written along a path at most."""
+"""Colours of a path from start to end; all are visible on white, and distinct when printed."""
+MAX_TIME_LABELS = 7
+"""Largest number of times that are written along a path."""
 
 
 def new_figure(width: float, height: float, **panels: Any) -> tuple["Figure", Any]:
-    """An empty figure, in inches, and its axes: what ``Figure.subplots`` makes of the panels."""
+    """Creates an empty figure and its axes.
+
+    Args:
+        width, height: in inches.
+        panels: arguments of ``Figure.subplots``.
+    """
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(width, height), layout="constrained")
@@ -28,23 +33,24 @@ def new_figure(width: float, height: float, **panels: Any) -> tuple["Figure", An
 
 
 def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figure":
-    """Estimate over truth, seen from above (paper fig. 4).
+    """Estimated and true trajectory seen from above (paper fig. 4).
 
     Args:
         title: above the axes.
-        truth, estimate: laser poses (N, 4, 4) in metres, each laid at its own first pose.
+        truth, estimate: laser poses (N, 4, 4) in metres. Each trajectory is drawn in the frame of its own
+            first pose.
     """
     figure, axes = new_figure(7, 6)
-    # Driving up the page, left turns to the left.
-    seen = ((np.linalg.inv(poses[0]) @ poses)[:, :2, 3] @ ((0, 1), (-1, 0)) for poses in (truth, estimate))
-    draw_trajectory(axes, title, *seen)
+    # The robot drives up the page, and left turns go to the left.
+    places = ((np.linalg.inv(poses[0]) @ poses)[:, :2, 3] @ ((0, 1), (-1, 0)) for poses in (truth, estimate))
+    draw_trajectory(axes, title, *places)
     return figure
 
 
 def draw_trajectory(axes: "Axes", title: str, truth: FloatArray, estimate: FloatArray) -> None:
-    """Estimate over truth, (N, 2) metres to the right and ahead of the start."""
-    for way, colour, label in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
-        axes.plot(*way.T, color=colour, label=label, linewidth=1.5)
+    """Draws the estimated and the true trajectory, (N, 2) metres to the right and ahead of the start."""
+    for path, colour, label in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
+        axes.plot(*path.T, color=colour, label=label, linewidth=1.5)
     axes.plot(0, 0, "k^", label="start")
     axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
     axes.set_aspect("equal", adjustable="datalim")
@@ -53,11 +59,11 @@ def draw_trajectory(axes: "Axes", title: str, truth: FloatArray, estimate: Float
 
 
 def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figure":
-    """Rotation and translation of every frame, estimate over truth (paper fig. 5).
+    """Estimated and true rotation and translation of every frame (paper fig. 5).
 
     Args:
         title: above the axes.
-        truth, estimate: motions (N, 2) in metres and radians.
+        truth, estimate: motions (N, 2), distance in metres and heading change in radians.
     """
     figure, panels = new_figure(11, 6, nrows=2, sharex=True)
     figure.suptitle(title)
@@ -74,11 +80,14 @@ def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figur
 
 
 def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
-    """How many errors lie within so many of their estimated standard deviations, beside normal errors.
+    """Share of the errors within k estimated standard deviations, for k from 0 to 4.
+
+    The curve of normally distributed errors is drawn for comparison.
 
     Args:
         title: above the axes.
-        ratios: absolute errors of distance and heading over their deviations, (N, 2); nan where unknown.
+        ratios: absolute errors of distance and heading divided by their estimated standard deviations,
+            (N, 2); nan where the deviation is unknown.
     """
     from scipy.stats import halfnorm
 
@@ -100,18 +109,18 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
 def map_figure(
     poses: FloatArray, points: list[npt.NDArray[np.float32]], times: FloatArray, clock: str = "seconds"
 ) -> "Figure":
-    """Scans laid where they were taken, seen from above, and the path, coloured by time.
+    """Map of all scans at their poses, seen from above, and the path, coloured by time.
 
-    The darker a place, the more beams it returned. Where walls are thin lines the poses agree with each
-    other; where they are doubled or blurred, not.
+    A place is darker the more returns it has. Thin walls mean that the poses agree with each other; doubled
+    or blurred walls mean that they do not.
 
     Args:
-        poses: x, y and heading of the scans, (N, 3).
-        points: of each scan (P, 2), in the frame of the poses, metres.
-        times: of the scans, (N,).
-        clock: what the times are.
+        poses: x and y in metres and heading in radians of the scans, (N, 3).
+        points: the points of each scan, (P, 2) metres, in the frame of the poses.
+        times: times of the scans, (N,).
+        clock: label of the times, with their unit.
     """
-    places = np.concatenate([*points, poses[:, :2]]) @ ((0, 1), (-1, 0))  # driving up the page
+    places = np.concatenate([*points, poses[:, :2]]) @ ((0, 1), (-1, 0))  # The robot drives up the page.
     low, high = places.min(0), places.max(0)
     width, height = np.maximum(high - low, 1.0).tolist()
     scale = 5.2 / max(width, height)
@@ -129,10 +138,10 @@ def map_figure(
 
 
 def _draw_returns(axes: "Axes", places: FloatArray, low: FloatArray, high: FloatArray) -> None:
-    """Returns (P, 2) between two corners in metres, darker where there are more."""
+    """Draws returns (P, 2) between two corners in metres; places with more returns are darker."""
     from matplotlib.colors import LogNorm
 
-    # As many cells as the picture has dots, so that a wall is as thin as it can be shown.
+    # One cell for each pixel of the figure, about, so that walls are as thin as possible.
     cell = max(0.05, float((high - low).max()) / 1000)
     cells = np.maximum(1, np.ceil((high - low) / cell)).astype(int).tolist()
     limits = [(float(start), float(start + count * cell)) for start, count in zip(low, cells, strict=True)]
@@ -149,7 +158,7 @@ def _draw_returns(axes: "Axes", places: FloatArray, low: FloatArray, high: Float
 
 
 def _draw_path_by_time(axes: "Axes", path: FloatArray, times: FloatArray, clock: str) -> None:
-    """A path (N, 2) in metres, its colour telling the time (N,), with a scale and numbers along it."""
+    """Draws a path (N, 2) in metres, coloured by time (N,), with a colour bar and times along the path."""
     from matplotlib.collections import LineCollection
     from matplotlib.colors import LinearSegmentedColormap
     from matplotlib.patheffects import withStroke
@@ -162,11 +171,11 @@ def _draw_path_by_time(axes: "Axes", path: FloatArray, times: FloatArray, clock:
     pieces.set_clim(times[0], max(times[-1], times[0] + 1e-9))
     axes.add_collection(pieces)
     axes.figure.colorbar(pieces, ax=axes, location="bottom", label=clock, aspect=40, shrink=0.9, pad=0.02)
-    near, written = 0.03 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())), [path[0], path[-1]]
-    for time in MaxNLocator(NUMBERS_ON_PATH).tick_values(times[0], times[-1]):
+    spacing, labelled = 0.03 * max(np.ptp(axes.get_xlim()), np.ptp(axes.get_ylim())), [path[0], path[-1]]
+    for time in MaxNLocator(MAX_TIME_LABELS).tick_values(times[0], times[-1]):
         place = path[min(int(np.searchsorted(times, time)), len(path) - 1)]
-        if all(np.hypot(*(place - other)) > near for other in written):
-            written.append(place)
+        if all(np.hypot(*(place - other)) > spacing for other in labelled):
+            labelled.append(place)
             axes.plot(*place, "o", color="black", markersize=3.5, zorder=3)
             axes.annotate(
                 f"{time:g}",

@@ -1,4 +1,4 @@
-"""How long an estimator takes for a frame, one frame after the other as on a robot."""
+"""Measures the computing time per frame of an estimator, one frame after the other as on a robot."""
 
 import sys
 import time
@@ -13,20 +13,20 @@ from rcnn_odom.models.tracking import Tracking
 from rcnn_odom.recordings.scan import Scan
 
 WARM_UP = 5
-"""Frames before the clock starts: memory and caches find their places."""
+"""Frames before the measurement, which fill the caches and allocate memory."""
 FRAMES = 100
-"""That are measured at most."""
+"""Largest number of measured frames."""
 
 
 def measure(stepper: Stepper, scans: npt.NDArray[np.float32]) -> dict[str, Any]:
-    """Median and 99th percentile of the time from an encoded scan to a step, on one thread.
+    """Median and 99th percentile of the time from an encoded scan to its step, on one thread.
 
     Args:
-        stepper: estimates the steps.
-        scans: encoded, (N, bins), at least two.
+        stepper: the estimator.
+        scans: encoded scans (N, bins), at least two.
 
     Returns:
-        ``median_ms``, ``p99_ms``, ``frames`` and ``threads``.
+        ``median_ms`` and ``p99_ms`` in milliseconds, ``frames`` (how many were measured) and ``threads``.
     """
     scans = np.array(scans[: FRAMES + 1])
     pairs = [scans[frame : frame + 2] for frame in range(len(scans) - 1)]
@@ -34,11 +34,11 @@ def measure(stepper: Stepper, scans: npt.NDArray[np.float32]) -> dict[str, Any]:
 
 
 def measure_tracker(tracker: ScanTracker, scans: Sequence[Scan]) -> dict[str, Any]:
-    """The same of a model of whole scans: the time from a scan as the laser gave it to a step.
+    """The same as :func:`measure` for a model of whole scans: the time from a raw scan to its step.
 
     Args:
-        tracker: estimates the steps.
-        scans: at least two.
+        tracker: the estimator.
+        scans: raw scans, at least two.
     """
     tracking = Tracking(tracker)
 
@@ -52,14 +52,15 @@ def measure_tracker(tracker: ScanTracker, scans: Sequence[Scan]) -> dict[str, An
 def _measure(
     step: Callable[[Any], object], restart: Callable[[], None], frames: Sequence[Any]
 ) -> dict[str, Any]:
-    torch = sys.modules.get("torch")  # A stepper that computes with it has imported it; others need it not.
+    """Times each call of ``step``; ``restart`` resets the estimator before and after."""
+    torch = sys.modules.get("torch")  # None: the estimator does not use torch, otherwise it is imported.
     threads = torch.get_num_threads() if torch else 1
     try:
         if torch:
             torch.set_num_threads(1)
-        for warm in (frames[:WARM_UP], frames):
+        for batch in (frames[:WARM_UP], frames):
             restart()
-            times = [_milliseconds(step, frame) for frame in warm]
+            times = [_milliseconds(step, frame) for frame in batch]
     finally:
         if torch:
             torch.set_num_threads(threads)

@@ -1,4 +1,4 @@
-"""Trajectories against relations between single scans that people have verified, without a global truth.
+"""Scores a trajectory against hand-verified relations between scans; no global ground truth is needed.
 
 Kuemmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss and Kleiner, "On Measuring the Accuracy of SLAM
 Algorithms", Autonomous Robots 27, 2009.
@@ -16,18 +16,23 @@ from rcnn_odom.geometry import FloatArray, planar_to_poses
 from rcnn_odom.recordings.trajectory import read_numbers
 
 LOOP_PATH = 5.0
-"""Metres driven between two scans, from which on their relation closes a loop. The others follow the robot
-from one place to the next: on the benchmark's ``aces`` and ``intel`` they span at most 0.6 m, and loops
-10 m and more."""
+"""A relation closes a loop if the robot drove more metres than this between its scans; otherwise it is
+sequential. On ``aces`` and ``intel`` of the benchmark, sequential relations span at most 0.6 m and loops at
+least 10 m."""
 
 
 @dataclass(frozen=True, eq=False)
 class Relations:
-    """Relative poses between pairs of scans.
+    """Verified relative poses between pairs of scans.
 
     Attributes:
-        times: (R, 2) stamps of the earlier and the later scan as :func:`stamp_keys` gives them.
-        steps: (R, 3) x and y in metres and heading in radians of the later in the earlier scan's frame.
+        times: (R, 2) stamps of the two scans in whole microseconds, see :func:`stamp_keys`.
+        steps: (R, 3) pose of the second scan in the frame of the first: x and y in metres, heading in
+            radians.
+
+    Example:
+        >>> Relations(stamp_keys([[0.5, 1.5]]), np.array([[1.0, 0.0, 0.0]])).times
+        array([[ 500000, 1500000]])
     """
 
     times: npt.NDArray[np.int64]
@@ -35,26 +40,58 @@ class Relations:
 
 
 def stamp_keys(seconds: npt.ArrayLike) -> npt.NDArray[np.int64]:
-    """Stamps in whole microseconds, (N,), to be compared: text files round them there."""
+    """Rounds stamps to whole microseconds, as text files do, so that equal stamps compare equal.
+
+    Args:
+        seconds: stamps of any shape.
+
+    Returns:
+        Whole microseconds of the same shape.
+
+    Example:
+        >>> stamp_keys([976052905.1673030, 0.25]).tolist()
+        [976052905167303, 250000]
+    """
     return np.round(np.asarray(seconds, dtype=np.float64) * 1e6).astype(np.int64)
 
 
 def read_relations(path: str | Path) -> Relations:
-    """Read lines of ``t1 t2 x y z roll pitch yaw``: seconds, metres and radians; only x, y and yaw are kept.
+    """Reads lines of ``t1 t2 x y z roll pitch yaw`` in seconds, metres and radians; keeps x, y and yaw.
 
     Raises:
-        InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
-            finite numbers.
+        InputError: the file cannot be read or is empty, or a line (its number is in the message) does not
+            contain eight finite numbers.
+
+    Example:
+        >>> from tempfile import NamedTemporaryFile
+        >>> with NamedTemporaryFile("w+", suffix=".relations") as file:
+        ...     _ = file.write("0.5 1.5 1.0 0.0 0.0 0.0 0.0 0.1")
+        ...     file.flush()
+        ...     relations = read_relations(file.name)
+        >>> relations.steps
+        array([[1. , 0. , 0.1]])
     """
     rows = read_numbers(path, 8, "a relation has 8 numbers, t1 t2 x y z roll pitch yaw")
     return Relations(stamp_keys(rows[:, :2]), rows[:, [2, 3, 7]])
 
 
 def find_scans(relations: Relations, stamps: npt.NDArray[np.int64]) -> npt.NDArray[np.int64]:
-    """Numbers (R, 2) of the scans with a relation's times among the stamps (N,); -1 where there is none.
+    """Finds the scans of each relation by their stamps.
+
+    Args:
+        relations: R relations.
+        stamps: (N,) stamps of all scans, see :func:`stamp_keys`; their order does not matter.
+
+    Returns:
+        Indices (R, 2) of the two scans of each relation; -1 if no scan has the stamp.
 
     Raises:
-        InputError: several scans have one of these stamps.
+        InputError: several scans have a stamp of a relation.
+
+    Example:
+        >>> relations = Relations(stamp_keys([[1.0, 2.0], [2.0, 9.0]]), np.zeros((2, 3)))
+        >>> find_scans(relations, stamp_keys([0.0, 1.0, 2.0])).tolist()
+        [[1, 2], [2, -1]]
     """
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
@@ -62,8 +99,8 @@ def find_scans(relations: Relations, stamps: npt.NDArray[np.int64]) -> npt.NDArr
     if (last - first > 1).any():
         time = relations.times[last - first > 1][0] / 1e6
         raise InputError(
-            f"{time:.6f} s is the stamp of several scans, and the relations name it; give a log "
-            "whose stamps differ"
+            f"{time:.6f} s is the stamp of several scans, and a relation refers to it; give a log "
+            "whose stamps are unique"
         )
     return np.where(last > first, order[np.minimum(first, len(order) - 1)], -1)
 
@@ -75,26 +112,35 @@ def score_relations(
     poses: FloatArray,
     loop_path: float = LOOP_PATH,
 ) -> dict[str, Any]:
-    """Errors against sequential relations, against loops, and against all of them.
+    """Errors of a trajectory against sequential relations, against loop closures, and against all relations.
 
     Args:
-        relations: verified by people.
-        stamps: (N,) of all scans of the log, see :func:`stamp_keys`.
-        driven: (N,) metres along the log's way, by which loops are known from sequential relations.
-        poses: estimated laser poses (N, 4, 4), nan where there is none.
-        loop_path: metres driven from which on a relation closes a loop.
+        relations: the verified relations.
+        stamps: (N,) stamps of all scans of the log, see :func:`stamp_keys`.
+        driven: (N,) path length in metres up to each scan, which separates loops from sequential relations.
+        poses: estimated laser poses (N, 4, 4), nan if a scan has no estimate.
+        loop_path: a relation closes a loop if more metres than this were driven between its scans.
 
     Returns:
-        ``sequential``, ``loop`` and ``all`` (see :func:`summarise`), and how many relations are left out:
-        ``not_in_log`` and ``not_in_estimate``.
+        ``sequential``, ``loop`` and ``all`` (see :func:`summarise`); ``not_in_log`` and ``not_in_estimate``,
+        the numbers of relations that were left out because a scan or its estimate is missing.
 
     Raises:
-        InputError: none is left, or several scans have a stamp that relations name.
+        InputError: no relation is left, or several scans have a stamp of a relation.
+
+    Example:
+        >>> relations = Relations(stamp_keys([[0.0, 1.0]]), np.array([[1.0, 0.0, 0.0]]))
+        >>> poses = planar_to_poses([[0.0, 0.0, 0.0], [1.1, 0.0, 0.0]])  # 0.1 m too far
+        >>> report = score_relations(relations, stamp_keys([0.0, 1.0]), np.array([0.0, 1.0]), poses)
+        >>> report["sequential"]["count"], round(report["sequential"]["translation_mean_m"], 3)
+        (1, 0.1)
     """
     scans = find_scans(relations, stamps)
     in_log = (scans >= 0).all(1)
     if not in_log.any():
-        raise InputError(f"none of the {len(scans)} relations has its times in the log; give the log's own")
+        raise InputError(
+            f"the log has the scans of none of the {len(scans)} relations; give the relations of this log"
+        )
     known = in_log & np.isfinite(poses[scans]).all((1, 2, 3))
     if not known.any():
         raise InputError(
@@ -109,12 +155,20 @@ def score_relations(
 
 
 def relation_errors(poses: FloatArray, scans: npt.NDArray[np.int64], steps: FloatArray) -> FloatArray:
-    """Errors (R, 2), metres and radians, not negative, of a trajectory against relations.
+    """Absolute errors of a trajectory against relations.
 
     Args:
         poses: laser poses (N, 4, 4), x forward and y left.
-        scans: (R, 2) rows of them.
-        steps: (R, 3) verified x and y in metres and heading in radians.
+        scans: (R, 2) indices of the two poses of each relation.
+        steps: (R, 3) verified relative poses, x and y in metres and heading in radians.
+
+    Returns:
+        Errors (R, 2) in metres and radians, 0 or more.
+
+    Example:
+        >>> poses = planar_to_poses([[0.0, 0.0, 0.0], [1.0, 0.3, 0.1]])
+        >>> relation_errors(poses, np.array([[0, 1]]), np.array([[1.0, 0.0, 0.0]])).round(3)
+        array([[0.3, 0.1]])
     """
     estimated = np.linalg.inv(poses[scans[:, 0]]) @ poses[scans[:, 1]]
     error = np.linalg.inv(planar_to_poses(steps)) @ estimated
@@ -123,7 +177,18 @@ def relation_errors(poses: FloatArray, scans: npt.NDArray[np.int64], steps: Floa
 
 
 def summarise(errors: FloatArray) -> dict[str, Any]:
-    """Count, mean and median of errors (R, 2) in metres and radians; no relation has none."""
+    """Number, mean and median of errors (R, 2) in metres and radians.
+
+    Returns:
+        ``count``; and, if it is not 0, ``translation_mean_m``, ``translation_median_m``,
+        ``rotation_mean_deg`` and ``rotation_median_deg``.
+
+    Example:
+        >>> summarise(np.array([[0.1, 0.0], [0.3, 0.0]]))["translation_mean_m"]
+        0.2
+        >>> summarise(np.empty((0, 2)))
+        {'count': 0}
+    """
     report: dict[str, Any] = {"count": len(errors)}
     if len(errors):
         for name, values in (

@@ -1,4 +1,4 @@
-"""What is in a run's folder, and how it is read again; for those who train and for those who compare."""
+"""The files of a run's folder and functions that read them, for training and for reports."""
 
 import json
 import os
@@ -14,14 +14,19 @@ from rcnn_odom.errors import InputError
 CONFIG, METRICS, ERROR = "config.yaml", "metrics.json", "error.txt"
 BEST, LAST = "checkpoints/best.ckpt", "checkpoints/last.ckpt"
 RUNNING = ".running.lock"
-"""Held while a run is trained."""
+"""Lock that the training process holds."""
 
 Settings = dict[str, Any]
-"""Plain numbers, strings, lists and dictionaries: what YAML, JSON and a checkpoint may hold."""
+"""Plain numbers, strings, lists and dictionaries, which YAML, JSON and checkpoints can store."""
 
 
 def flat(settings: Settings, prefix: str = "") -> Settings:
-    """The settings under names as on the command line, ``model.kernel_size`` and so on."""
+    """Flattens nested settings to dotted names as on the command line.
+
+    Example:
+        >>> flat({"seed": 0, "model": {"kernel_size": 3}})
+        {'seed': 0, 'model.kernel_size': 3}
+    """
     pairs: Settings = {}
     for key, value in settings.items():
         pairs |= flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
@@ -29,42 +34,44 @@ def flat(settings: Settings, prefix: str = "") -> Settings:
 
 
 def home_of(run: Path) -> Path:
-    """The folder where a run really is: ``outputs/latest`` only holds links to what is in it."""
+    """The real folder of a run; ``outputs/latest`` contains only links to the files of that folder."""
     return Path(os.path.relpath((run / CONFIG).resolve().parent)) if (run / CONFIG).is_symlink() else run
 
 
 def find_weights(path: Path) -> Path:
-    """The file of the best weights of a finished run; a path that is no folder as it is.
+    """Finds the checkpoint with the best weights of a finished run.
 
-    ``outputs/latest`` shows a fine-tuning as soon as that has begun. Until it has finished, ``latest`` stands
-    for the weights that it began with, so that the same command goes on with the same weights.
+    ``outputs/latest`` points to a fine-tuning as soon as the fine-tuning has started. Until it has finished,
+    ``latest`` means the weights that it started from, so that repeating an interrupted command continues
+    with the same weights.
 
     Args:
-        path: of a checkpoint, of a run's folder, or of ``outputs/latest``.
+        path: a run's folder or ``outputs/latest``; a path that is not a folder, such as a checkpoint, is
+            returned unchanged.
 
     Raises:
-        InputError: the folder is none of a run, or of one that has not finished.
+        InputError: the folder is not a run's folder, or the run has not finished.
     """
     if not path.is_dir():
         return path
     run, settings = home_of(path), read_settings(path)
     if has_finished(run):
         return run / BEST
-    begun_with = settings["model"].get("pretrained")
-    if begun_with and (path / CONFIG).is_symlink():
-        return Path(begun_with)
-    raise InputError(f"{path}: a run that has not finished; let it finish, or give its {BEST}")
+    pretrained = settings["model"].get("pretrained")
+    if pretrained and (path / CONFIG).is_symlink():
+        return Path(pretrained)
+    raise InputError(f"{path}: this run has not finished; let it finish, or give its {BEST}")
 
 
 def read_settings(run: Path, groups: Collection[str] = ("data", "model", "trainer")) -> Settings:
-    """The configuration that a run was started with.
+    """Reads the configuration that a run was started with.
 
     Args:
-        run: its folder.
-        groups: without which it is no configuration of a run.
+        run: the run's folder.
+        groups: groups of options that the configuration must have.
 
     Raises:
-        InputError: there is no run, or its configuration cannot be read.
+        InputError: there is no configuration, or it cannot be read or lacks a group.
     """
     try:
         settings = yaml.safe_load((run / CONFIG).read_text(encoding="utf-8"))
@@ -74,15 +81,15 @@ def read_settings(run: Path, groups: Collection[str] = ("data", "model", "traine
         settings = None
     if not isinstance(settings, dict) or not all(isinstance(settings.get(group), dict) for group in groups):
         raise InputError(f"{run / CONFIG}: not the configuration of a run; name another, run=outputs/...")
-    _upgrade(settings["data"], settings["model"])
+    _upgrade_settings(settings["data"], settings["model"])
     return settings
 
 
-def _upgrade(data: Settings, model: Settings) -> None:
-    """Brings a configuration of version 0.1 into today's form.
+def _upgrade_settings(data: Settings, model: Settings) -> None:
+    """Converts a configuration of version 0.1 to the present form, in place.
 
-    There a recording's format was the full name of a function, and a model did not know where in a turn its
-    distance is driven.
+    In version 0.1 the format of a recording was the full name of a function, and ``apply``, the place in the
+    turn where a step is applied, was an option of the data only, not of the model.
     """
     reader = data.get("reader")
     if isinstance(reader, dict) and "_target_" in reader:
@@ -95,30 +102,30 @@ def _upgrade(data: Settings, model: Settings) -> None:
 
 
 def read_metrics_file(run: Path) -> dict[str, Any]:
-    """What the ``metrics.json`` of a finished run holds.
+    """Reads the ``metrics.json`` of a finished run.
 
     Raises:
-        OSError: there is none.
-        ValueError: it is damaged, or holds something that is no number.
+        OSError: the file does not exist or cannot be read.
+        ValueError: the file is damaged, or contains nan or infinity.
     """
-    content = json.loads((run / METRICS).read_text(encoding="utf-8"), parse_constant=_refuse)
+    content = json.loads((run / METRICS).read_text(encoding="utf-8"), parse_constant=_refuse_constant)
     if not isinstance(content, dict):
-        raise ValueError("holds no names")
+        raise ValueError("the content is not a JSON object")
     return content
 
 
 def has_finished(run: Path) -> bool:
-    """Whether a run has its scores and they are final: not those of a training that can go on."""
+    """Whether a run has final scores: false while its training can still be continued."""
     return (run / METRICS).exists() and stopped_by(run) is None
 
 
 def stopped_by(run: Path) -> str | None:
-    """What ended a training before its last epoch, as its ``metrics.json`` says; None for others."""
+    """Why a training ended before its last epoch, from its ``metrics.json``; None if it did not."""
     with suppress(OSError, ValueError, AttributeError):
         reason = (read_metrics_file(run).get("training") or {}).get("stopped_by")
         return None if reason is None else str(reason)
     return None
 
 
-def _refuse(constant: str) -> None:
+def _refuse_constant(constant: str) -> None:
     raise ValueError(f"{constant} is not a score")

@@ -1,4 +1,4 @@
-"""What a scoring leaves behind: scores beside the baselines, trajectories, figures."""
+"""The report of a run: scores of the model and of the baselines, trajectory files and figures."""
 
 import logging
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -14,7 +14,7 @@ from rcnn_odom.evaluation.run_folder import Settings
 from rcnn_odom.evaluation.scores import (
     coverage,
     coverage_table,
-    in_deviations,
+    errors_in_deviations,
     metrics_table,
     path_ratio,
     percent,
@@ -33,8 +33,9 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PACKAGES = ("torch", "lightning", "hydra-core", "torchmetrics", "numpy", "scipy", "numba", "rcnn-odom")
-SIDEWAYS = 1e-5
-"""Metres to the side from which on a step says more than two numbers: above a network's rounding."""
+LATERAL_TOLERANCE = 1e-5
+"""Largest lateral deviation in metres that counts as rounding; beyond it a step contains more than distance
+and heading change."""
 
 
 def report_drives(
@@ -47,28 +48,28 @@ def report_drives(
     folder: Path,
     add_figure: Callable[[str, "Figure"], None] | None = None,
 ) -> Report:
-    """Scores a model's estimates beside the baselines; writes trajectories and figures.
+    """Scores the estimates of a model and of the baselines; writes trajectories and figures.
 
     Args:
-        name: of the model.
-        steps: what it makes of the drives, by their name.
-        mean_step: (3,) of the training drives, which the baseline ``mean_motion`` repeats; None where it
-            is not known.
-        latency: the model's time, see :func:`rcnn_odom.evaluation.latency.measure`.
-        drives: with their truth.
+        name: name of the model.
+        steps: the model's steps by the name of the drive.
+        mean_step: (3,) mean step of the training drives, which the baseline ``mean_motion`` repeats; None if
+            it is unknown.
+        latency: computing time of the model, see :func:`rcnn_odom.evaluation.latency.measure`.
+        drives: drives with ground truth.
         data: the options of ``conf/data``.
-        folder: gets ``trajectories`` and ``figures``.
-        add_figure: also gets each figure, and its name.
+        folder: folder in which ``trajectories`` and ``figures`` are written.
+        add_figure: also called with the name of each figure and the figure.
 
     Returns:
-        ``test`` (see :func:`rcnn_odom.evaluation.scores.score_all`); ``baselines`` of the same form by name,
-        among them ``NAME_two_numbers`` where the steps say more than two numbers can; ``latency``;
-        ``path_ratio``, by drive the length of the estimated path over that of the true one (None where that
-        stands still); ``versions`` of what computed them; and where covariances are known ``coverage`` by
-        drive (see :func:`rcnn_odom.evaluation.scores.coverage`).
+        ``test`` (see :func:`rcnn_odom.evaluation.scores.score_all`); ``baselines``, the same by the name of
+        the baseline, with ``NAME_two_numbers`` among them if the steps contain more than distance and
+        heading change; ``latency``; ``path_ratio`` by drive, the estimated path length divided by the true
+        one (None if the true one is 0); ``versions`` of the packages that were used; and, if covariances are
+        known, ``coverage`` by drive (see :func:`rcnn_odom.evaluation.scores.coverage`).
     """
     baselines = baseline_steps(mean_step, drives)
-    methods = {name: steps, **baselines, **_in_two_numbers(name, steps, data["apply"])}
+    methods = {name: steps, **baselines, **_reduce_steps(name, steps, data["apply"])}
     reports = {
         method: score_all(drives, estimated, data["lengths"], data["apply"])
         for method, estimated in methods.items()
@@ -97,28 +98,38 @@ def report_drives(
     return report
 
 
-def _in_two_numbers(name: str, steps: Mapping[str, Steps], apply: Apply) -> dict[str, dict[str, Steps]]:
-    """Steps cut to what two numbers can say, comparable with the floor; nothing where they say no more."""
-    if max(_sideways(every.values, apply) for every in steps.values()) < SIDEWAYS:
+def _reduce_steps(name: str, steps: Mapping[str, Steps], apply: Apply) -> dict[str, dict[str, Steps]]:
+    """The steps reduced to distance and heading change, which can be compared with the floor.
+
+    Args:
+        name: name of the model.
+        steps: its steps by the name of the drive.
+        apply: where along the turn a distance is driven.
+
+    Returns:
+        The reduced steps by drive under ``NAME_two_numbers``; empty if the steps contain nothing else.
+    """
+    if max(_lateral_deviation(every.values, apply) for every in steps.values()) < LATERAL_TOLERANCE:
         return {}
-    cut = {
+    reduced = {
         drive: Steps.with_unknown_covariance(restate(every.values, apply)) for drive, every in steps.items()
     }
-    return {f"{name}_two_numbers": cut}
+    return {f"{name}_two_numbers": reduced}
 
 
-def _sideways(steps: FloatArray, apply: Apply) -> float:
-    """The farthest, in metres, that steps (N, 3) go beside the direction that their turn alone gives."""
+def _lateral_deviation(steps: FloatArray, apply: Apply) -> float:
+    """Largest lateral deviation in metres of steps (N, 3) from the direction that their turns alone give."""
     direction = steps_of(np.stack([np.ones(len(steps)), steps[:, 2]], axis=1), apply)
     return float(np.abs(direction[:, 0] * steps[:, 1] - direction[:, 1] * steps[:, 0]).max())
 
 
 def baseline_steps(mean_step: FloatArray | None, drives: Sequence[Drive]) -> dict[str, dict[str, Steps]]:
-    """What the baselines estimate, by their name and the drive's.
+    """Steps of the baselines, by the name of the baseline and then of the drive.
 
     Args:
-        mean_step: (3,) that ``mean_motion`` repeats; without it that is left out.
-        drives: to estimate; with ``wheel_odometry`` where all of them have it.
+        mean_step: (3,) step that the baseline ``mean_motion`` repeats; None leaves this baseline out.
+        drives: drives to estimate. If all of them have wheel odometry, it is the baseline
+            ``wheel_odometry``.
     """
     constant = {"mean_motion": ConstantStep(mean_step)} if mean_step is not None else {}
     baselines = {
@@ -135,13 +146,15 @@ def baseline_steps(mean_step: FloatArray | None, drives: Sequence[Drive]) -> dic
 
 
 def write_drive(drive: Drive, steps: Steps, baselines: Mapping[str, FloatArray], folder: Path) -> None:
-    """A drive's estimated trajectory in KITTI's and TUM's format, its truth, and the motions of all methods.
+    """Writes a drive's estimated and true trajectory, and the motions of all methods.
+
+    The estimate is written in KITTI's and in TUM's format, the truth in KITTI's, the motions as CSV.
 
     Args:
-        drive: with its truth.
-        steps: estimated.
-        baselines: motions (N-1, 2) of other methods by their names.
-        folder: for the files.
+        drive: a drive with ground truth.
+        steps: the estimated steps.
+        baselines: motions (N-1, 2) of the other methods by name.
+        folder: folder of the files; it is created if missing.
     """
     folder.mkdir(parents=True, exist_ok=True)
     name = file_name(drive.name)
@@ -157,7 +170,7 @@ def _save_figures(
     folder: Path,
     add_figure: Callable[[str, "Figure"], None] | None,
 ) -> None:
-    """Figures by their names as files, and to whoever else wants them."""
+    """Saves each figure under its name as a PNG file, and passes it to ``add_figure``."""
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures:
         figure.savefig(folder / f"{name}.png", dpi=120)
@@ -168,14 +181,14 @@ def _save_figures(
 def _figures(
     name: str, steps: Mapping[str, Steps], drives: Sequence[Drive], data: str, test: Report
 ) -> Iterator[tuple[str, "Figure"]]:
-    """The paper's two figures of each drive, and how the errors lie within their deviations."""
+    """The two figures of the paper for each drive, and the figure of the coverage if deviations are known."""
     for drive in drives:
         drift = percent(test["sequences"][drive.name]["drift"]["t_err"])
         title = f"{name} on {data} {drive.name}: drift {drift} %"
         estimate, file = steps[drive.name], file_name(drive.name)
         yield f"{file}_trajectory", trajectory_figure(title, drive.poses, estimate.poses())
         yield f"{file}_motion", motion_figure(title, drive.motions, motions_of(estimate.values))
-    ratios = np.concatenate([in_deviations(steps[drive.name], drive.steps)[0] for drive in drives])
+    ratios = np.concatenate([errors_in_deviations(steps[drive.name], drive.steps)[0] for drive in drives])
     if len(ratios):
         names = ", ".join(drive.name for drive in drives)
         title = f"{name} on {data} {names}: errors within their estimated deviations"

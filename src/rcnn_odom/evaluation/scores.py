@@ -1,4 +1,4 @@
-"""Scores of estimated steps: drift, its floor, every metric; errors of a stretch; tables for terminals."""
+"""Scores of estimated steps: drift, its floor and all metrics; errors of a part of a drive; text tables."""
 
 from collections.abc import Mapping, Sequence
 
@@ -17,21 +17,22 @@ from rcnn_odom.models.two_numbers import Apply, restate, steps_of
 from rcnn_odom.recordings.recording import Drive
 
 SMOOTHING = 11
-"""Frames under the filter that takes the jitter out of a true distance: a second of KITTI."""
+"""Window in frames of the filter that removes the GPS jitter from true distances: about 1 s of KITTI."""
 
 
 def score(drive: Drive, steps: Steps, lengths: Sequence[float], apply: Apply = "end") -> Report:
-    """Everything that is reported of one drive.
+    """All scores of one drive.
 
     Args:
-        drive: with its truth.
-        steps: estimated.
-        lengths: of the drift's segments in metres.
-        apply: where along its turn a distance is driven, for the floor.
+        drive: a drive with ground truth.
+        steps: the estimated steps.
+        lengths: segment lengths of the drift in metres.
+        apply: where along the turn a distance is driven, for the floor.
 
     Returns:
-        ``drift`` of the estimate and ``floor``, the drift of the true steps cut to two numbers, both as the
-        command line prints them; the errors of single frames; and every other metric.
+        ``drift`` of the estimate and ``floor``, the drift of the true steps reduced to distance and heading
+        change, both as in the JSON of ``rcnn-odom drift``; ``frames``, the number of scans; the errors of
+        single frames (see :func:`rcnn_odom.evaluation.metrics.frame_errors`); and all other metrics.
     """
     floor = Steps.with_unknown_covariance(restate(drive.steps, apply))
     return {
@@ -46,20 +47,20 @@ def score(drive: Drive, steps: Steps, lengths: Sequence[float], apply: Apply = "
 def score_all(
     drives: Sequence[Drive], steps: Mapping[str, Steps], lengths: Sequence[float], apply: Apply = "end"
 ) -> Report:
-    """Scores of all drives.
+    """Scores of several drives.
 
     Args:
-        drives: with their truth.
-        steps: estimated, by the name of the drive.
+        drives: drives with ground truth.
+        steps: the estimated steps by the name of the drive.
         lengths, apply: as in :func:`score`.
 
     Returns:
-        ``drift`` and ``floor`` (means over the drives that have a segment, ratios; None without any),
-        ``lengths``, ``metrics`` (each over all drives, by name), and the drives' own scores under
-        ``sequences``, see :func:`score`.
+        ``drift`` and ``floor``, ratios, means over the drives that have a segment (None if no drive has
+        one); ``lengths``; ``metrics``, each combined over all drives, by name; and ``sequences``, the scores
+        of the single drives by name (see :func:`score`).
     """
     scores = {drive.name: score(drive, steps[drive.name], lengths, apply) for drive in drives}
-    floors = [one["floor"]["t_err"] for one in scores.values() if one["floor"]["segments"]]
+    floors = [each["floor"]["t_err"] for each in scores.values() if each["floor"]["segments"]]
     metrics = combine(scores.values(), all_metrics().values())
     return {
         "drift": metrics["drift"],
@@ -70,18 +71,26 @@ def score_all(
     }
 
 
-def in_deviations(steps: Steps, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
+def errors_in_deviations(steps: Steps, truth: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Errors of distance and heading in units of their estimated standard deviations.
 
-    The deviation of the distance is that along the estimated heading in mid-turn, where the distance is too.
+    The distance is the projection of the step on the heading in mid-turn. Its deviation is therefore the
+    deviation of the position in the direction of the estimated heading in mid-turn.
 
     Args:
-        steps: estimated.
+        steps: the estimated steps.
         truth: true steps (N-1, 3).
 
     Returns:
-        Absolute errors over deviations, and the deviations (metres, radians), each (K, 2), of the K steps
-        of which one deviation at least is known; the other may be nan.
+        The absolute errors divided by the deviations, and the deviations (metres, radians). Both have shape
+        (K, 2) for the K steps with at least one known deviation; values of an unknown deviation are nan.
+
+    Example:
+        >>> covariance = np.diag([0.1**2, 0.1**2, 0.01**2])  # 0.1 m and 0.01 rad
+        >>> steps = Steps(np.array([[1.2, 0.0, 0.0]]), covariance[None])
+        >>> ratios, deviations = errors_in_deviations(steps, np.array([[1.0, 0.0, 0.0]]))
+        >>> ratios.round(3), deviations.round(3)  # the distance is 0.2 m, two deviations, too long
+        (array([[2., 0.]]), array([[0.1 , 0.01]]))
     """
     half = steps.values[:, 2] / 2
     along = np.stack([np.cos(half), np.sin(half)], axis=1)
@@ -93,18 +102,24 @@ def in_deviations(steps: Steps, truth: FloatArray) -> tuple[FloatArray, FloatArr
 
 
 def coverage(steps: Steps, truth: FloatArray) -> Report | None:
-    """How often the truth lies within one and two of the estimated standard deviations.
+    """Share of the errors within one and within two of their estimated standard deviations.
 
     Args:
-        steps: estimated.
+        steps: the estimated steps.
         truth: true steps (N-1, 3).
 
     Returns:
-        Shares under ``distance`` and ``heading``, there under ``1`` and ``2``: 0.683 and 0.954 for normal
-        errors and true deviations; and the mean deviations ``distance_m`` and ``heading_deg``. Without
-        those of the distance where no deviation of a distance is known; None where none is at all.
+        ``distance`` and ``heading``, each with the shares ``1`` and ``2`` (0.683 and 0.954 for normal errors
+        and correct deviations); and the mean estimated deviations ``distance_m`` and ``heading_deg``. The
+        entries of a quantity are missing if none of its deviations is known; None if both are missing.
+
+    Example:
+        >>> covariance = np.diag([0.1**2, 0.1**2, 0.01**2])  # 0.1 m and 0.01 rad
+        >>> steps = Steps(np.array([[1.15, 0.0, 0.0], [1.05, 0.0, 0.0]]), np.stack([covariance] * 2))
+        >>> coverage(steps, np.array([[1.0, 0.0, 0.0]] * 2))["distance"]  # errors of 0.15 and 0.05 m
+        {'1': 0.5, '2': 1.0}
     """
-    ratios, deviations = in_deviations(steps, truth)
+    ratios, deviations = errors_in_deviations(steps, truth)
     report: Report = {}
     for column, (name, unit, scale) in enumerate((("distance", "m", 1), ("heading", "deg", 180 / np.pi))):
         known = np.isfinite(deviations[:, column])
@@ -115,18 +130,25 @@ def coverage(steps: Steps, truth: FloatArray) -> Report | None:
 
 
 def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply: Apply = "end") -> Report:
-    """Errors of a stretch of a drive: of its single frames, and of the place where it ends.
+    """Errors of a part of a drive: of its single frames and of its end point.
 
     Args:
-        motions: estimated, of the whole drive, (N, 2) metres and radians.
-        truth: of the whole drive, (N, 2).
-        chosen: rows of the stretch, at least one.
-        apply: where along its turn a distance is driven, for both.
+        motions: estimated motions of the whole drive, (N, 2), metres and radians.
+        truth: true motions of the whole drive, (N, 2).
+        chosen: rows of the part, at least one.
+        apply: where along the turn a distance is driven, for both.
 
     Returns:
-        What :func:`frame_errors` gives, ``smoothed_distance_*`` against the smoothed true distance,
-        ``path_m``, and of the motions composed from the stretch's start ``end_m`` and ``end_ratio``, the
-        part of the path (None where the truth stands still).
+        The entries of :func:`rcnn_odom.evaluation.metrics.frame_errors`; ``smoothed_distance_*``, the errors
+        against the smoothed true distance; ``path_m``, the true path length of the part; ``end_m``, the
+        error of the end point if the motions are composed from the start of the part; and ``end_ratio``, this
+        error divided by the path length (None if the path length is 0).
+
+    Example:
+        >>> truth = np.array([[1.0, 0.0]] * 4)  # straight ahead, 1 m a frame
+        >>> errors = stretch_errors(truth + [0.1, 0.0], truth, slice(0, 2))  # 0.1 m a frame too long
+        >>> errors["path_m"], round(errors["end_m"], 3), round(errors["end_ratio"], 3)
+        (2.0, 0.2, 0.1)
     """
     report = frame_errors(motions[chosen], truth[chosen])
     smoothed = np.column_stack([smooth(truth[:, 0]), truth[:, 1]])
@@ -141,21 +163,21 @@ def stretch_errors(motions: FloatArray, truth: FloatArray, chosen: slice, apply:
 
 
 def path_ratio(steps: Steps, drive: Drive) -> float | None:
-    """Length of the estimated path over that of the true one: far below 1 where an estimate stands still.
+    """Length of the estimated path divided by that of the true path; None if the true length is 0.
 
-    Returns:
-        None where the truth stands still.
+    A value far below 1 shows that the estimate often stands still.
     """
     path, true_path = (float(np.hypot(*every[:, :2].T).sum()) for every in (steps.values, drive.steps))
     return path / true_path if true_path else None
 
 
 def smooth(distances: FloatArray) -> FloatArray:
-    """Distances (N,) without the jitter of a GPS: Savitzky-Golay, parabolas over ``SMOOTHING`` frames.
+    """Removes the jitter of a GPS from distances (N,): Savitzky-Golay filter of order 2.
 
-    Fewer frames are smoothed over the largest odd number of them; up to four come back as they are.
+    The window has ``SMOOTHING`` frames, or the largest odd number of frames that fits into a shorter drive.
+    Up to four distances are returned without a change.
     """
-    from scipy.signal import savgol_filter  # A second to import, which a training has no use for.
+    from scipy.signal import savgol_filter  # The import takes a second, and training does not need it.
 
     window = min(SMOOTHING, len(distances) - (len(distances) + 1) % 2)
     smoothed: FloatArray = savgol_filter(distances, window, polyorder=min(2, window - 1))
@@ -163,10 +185,10 @@ def smooth(distances: FloatArray) -> FloatArray:
 
 
 def table(reports: Mapping[str, Report]) -> str:
-    """Text with a row for each method and a column for each sequence, drift in percent.
+    """Text table of the drift in percent, with a row for each method and a column for each sequence.
 
     Args:
-        reports: of :func:`score_all` by the name of the method, all on the same sequences.
+        reports: results of :func:`score_all` by the name of the method, all on the same sequences.
     """
     first = next(iter(reports.values()))
     names = list(first["sequences"])
@@ -182,10 +204,10 @@ def table(reports: Mapping[str, Report]) -> str:
 
 
 def metrics_table(reports: Mapping[str, Report]) -> str:
-    """Text with a row for each method and a column for each metric over all sequences, without the drift.
+    """Text table of all metrics except the drift over all sequences, with a row for each method.
 
     Args:
-        reports: of :func:`score_all` by the name of the method.
+        reports: results of :func:`score_all` by the name of the method.
     """
     metrics = [metric for metric in all_metrics().values() if metric.name != "drift"]
     header = ["over all sequences", *(f"{metric.title} ({metric.unit})" for metric in metrics)]
@@ -196,7 +218,13 @@ def metrics_table(reports: Mapping[str, Report]) -> str:
 
 
 def aligned(rows: Sequence[Sequence[str]]) -> str:
-    """Rows of cells for a terminal, the first column to the left, the others to the right."""
+    """Text table: the first column is aligned to the left, the other columns to the right.
+
+    Example:
+        >>> print(aligned([["drift in %", "05"], ["matcher", "0.52"]]))
+        drift in %    05
+        matcher     0.52
+    """
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     lines = []
     for label, *cells in rows:
@@ -206,20 +234,25 @@ def aligned(rows: Sequence[Sequence[str]]) -> str:
 
 
 def percent(ratio: float | None) -> str:
-    """A ratio in percent; a dash where no segment was long enough to have one."""
+    """Formats a ratio in percent; a dash for None, where no segment was long enough.
+
+    Example:
+        >>> percent(0.0255), percent(None)
+        ('2.55', '-')
+    """
     return "-" if ratio is None else f"{100 * ratio:.2f}"
 
 
 def coverage_table(reports: Mapping[str, Report]) -> str:
-    """Text with a row for each sequence: how often the truth lies within the deviations, in percent.
+    """Text table of the share of errors within one and two deviations, with a row for each sequence.
 
     Args:
-        reports: of :func:`coverage` by the name of the sequence.
+        reports: results of :func:`coverage` by the name of the sequence.
     """
     columns = [(name, times) for name in ("distance", "heading") for times in ("1", "2")]
-    title = "truth within so many deviations, %"
+    title = "errors within 1 or 2 deviations, %"
     rows = [[title, *(f"{name} {times}" for name, times in columns), "mean, m", "mean, deg"]]
-    rows.append(["of normal errors", *["68.3", "95.4"] * 2, "", ""])
+    rows.append(["normal errors", *["68.3", "95.4"] * 2, "", ""])
     for sequence, report in reports.items():
         shares = [f"{100 * report[name][times]:.1f}" if name in report else "-" for name, times in columns]
         means = [f"{report[name]:.3f}" if name in report else "-" for name in ("distance_m", "heading_deg")]
@@ -228,10 +261,10 @@ def coverage_table(reports: Mapping[str, Report]) -> str:
 
 
 def frame_table(reports: Mapping[str, Report]) -> str:
-    """Text with a row for each method: errors of distance and heading a frame, and of the end point.
+    """Text table of the frame errors and the error of the end point, with a row for each method.
 
     Args:
-        reports: of :func:`stretch_errors` by the name of the method.
+        reports: results of :func:`stretch_errors` by the name of the method.
     """
     label, width = max(map(len, reports)), 10
     groups = {"distance, m": 3, "to smoothed truth, m": 3, "heading, deg": 3, "end point": 2}

@@ -1,4 +1,4 @@
-"""What a sweep's runs say together: a table of them all, and a report that says what differs."""
+"""Compares the runs of a sweep: a table of all runs, and a report with the differences between settings."""
 
 from rcnn_odom.evaluation.sweep_report.runs_table import load_runs
 

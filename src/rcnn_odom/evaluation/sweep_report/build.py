@@ -1,4 +1,4 @@
-"""A sweep's report, from its runs to its files."""
+"""Writes the report of a sweep from the folders of its runs."""
 
 import json
 from collections.abc import Sequence
@@ -10,11 +10,11 @@ from typing import Any
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.sweep_report.comparisons import (
     Comparison,
-    compare,
+    compare_settings,
     difference_section,
     drifts_by_setting,
     reference_setting,
-    result,
+    result_text,
 )
 from rcnn_odom.evaluation.sweep_report.document import image, text_table, write_report
 from rcnn_odom.evaluation.sweep_report.figures import (
@@ -30,7 +30,7 @@ from rcnn_odom.evaluation.sweep_report.sections import (
     drift_table,
     metrics_section,
     metrics_table,
-    opening,
+    opening_section,
     origin_section,
     paper_section,
     runs_section,
@@ -38,14 +38,14 @@ from rcnn_odom.evaluation.sweep_report.sections import (
 
 
 @dataclass(frozen=True)
-class Written:
-    """What a report left behind.
+class WrittenReport:
+    """The files and contents of a report.
 
     Attributes:
         markdown: path of ``report.md``.
         html: path of ``report.html``.
-        table: of drift and of the other metrics, for a terminal.
-        unfinished: runs that are not finished, missing ones included.
+        table: tables of the drift and of the other metrics as text for a terminal.
+        unfinished: number of runs that are not finished, including missing ones.
         content: ``runs``, the rows of ``load_runs``, and ``comparisons``, ready for JSON.
     """
 
@@ -61,18 +61,19 @@ def make_report(
     only: Sequence[str] = (),
     reference: Sequence[str] = (),
     expected: Sequence[str] | None = None,
-) -> Written:
+) -> WrittenReport:
     """Writes ``report.md``, ``report.html`` and ``report_figures`` into a folder of runs.
 
     Args:
-        directory: a sweep's folder, or any around runs.
-        only: ``KEY=VALUE`` of options that a run must have to be in the report.
-        reference: ``KEY=VALUE`` that single out the setting to compare the others with.
-        expected: names of the folders that the folder's last command asked for; None where not known.
+        directory: the folder of a sweep, or any folder that contains runs.
+        only: texts ``KEY=VALUE``; only runs with these values are in the report.
+        reference: texts ``KEY=VALUE`` that match the one setting to compare_settings the others with.
+        expected: names of the run folders that the last command of the folder should have made; None if they
+            are not known.
 
     Raises:
-        InputError: no such folder, no run in it, none of them finished, runs on different data, no such
-            reference, or a file in the way that is no earlier report.
+        InputError: there is no such folder, it contains no run or no finished run, the runs have different
+            data, no single setting matches the reference, or a file of the same name is not a report.
     """
     sweep = read_sweep(directory, only, expected)
     if not sweep.finished:
@@ -81,12 +82,12 @@ def make_report(
         raise InputError(f"{directory}: none of its {len(sweep.runs)} runs is finished{why}")
     chosen, why = reference_setting(sweep, reference)
     drifts = drifts_by_setting(sweep)
-    comparisons = compare(drifts, chosen)
+    comparisons = compare_settings(drifts, chosen)
     figures = {"drift": png(drift_figure({sweep.label(key): runs for key, runs in drifts.items()}))}
     table = runs_table(sweep)
     parts = [
-        opening(sweep, datetime.now()),
-        result(sweep, chosen, comparisons),
+        opening_section(sweep, datetime.now()),
+        result_text(sweep, chosen, comparisons),
         drift_section(sweep, image("drift", "mean drift of every run, by setting")),
         difference_section(sweep, chosen, why, comparisons),
         paper_section(sweep),
@@ -102,15 +103,15 @@ def make_report(
     unfinished = len(sweep.runs) - len(sweep.finished) + len(sweep.missing)
     rows = json.loads(table.dropna(axis="columns", how="all").to_json(orient="records"))
     content = {"runs": rows, "comparisons": _comparison_rows(sweep, chosen, comparisons)}
-    return Written(*paths, tables, unfinished, content)
+    return WrittenReport(*paths, tables, unfinished, content)
 
 
 def _comparison_rows(
     sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]
 ) -> list[dict[str, Any]]:
-    """Comparisons with a setting, ready for JSON."""
+    """The comparisons with the reference, ready for JSON."""
     return [
-        {"setting": sweep.label(one.setting), "against": sweep.label(reference), "verdict": one.verdict}
-        | {**asdict(one.ratio), "p_holm": one.adjusted_p}
-        for one in comparisons
+        {"setting": sweep.label(each.setting), "against": sweep.label(reference), "verdict": each.verdict}
+        | {**asdict(each.ratio), "p_holm": each.adjusted_p}
+        for each in comparisons
     ]

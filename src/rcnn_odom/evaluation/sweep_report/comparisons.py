@@ -1,4 +1,4 @@
-"""Which settings a report compares, what comes out, and how the report says it."""
+"""Compares the settings of a sweep with a reference, and describes the result in the report."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ from statistics import fmean
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.scores import percent
 from rcnn_odom.evaluation.sweep_report.document import DASH, Row, escape, markdown_table, number
-from rcnn_odom.evaluation.sweep_report.options import Values, matches, parse_choice
+from rcnn_odom.evaluation.sweep_report.options import Values, has_value, parse_choice
 from rcnn_odom.evaluation.sweep_report.paper import NETWORK
 from rcnn_odom.evaluation.sweep_report.runs_table import Sweep
 from rcnn_odom.evaluation.sweep_report.statistics import (
@@ -20,18 +20,19 @@ from rcnn_odom.evaluation.sweep_report.statistics import (
 )
 
 Drifts = dict[Values, dict[int, float]]
-"""Ratios by setting and seed."""
+"""Drifts (ratios) by setting and then by seed."""
 
 
 @dataclass(frozen=True)
 class Comparison:
-    """One setting against the reference.
+    """The comparison of one setting with the reference.
 
     Attributes:
-        setting: whose test drift is divided by the reference's.
-        ratio: of their drifts.
-        adjusted_p: the ratio's p value, adjusted for all comparisons of the table.
-        verdict: in words.
+        setting: the setting.
+        ratio: its test drift divided by that of the reference.
+        adjusted_p: p value of the ratio, adjusted for all comparisons of the table; None if nothing could
+            be tested.
+        verdict: the result in words.
     """
 
     setting: Values
@@ -41,7 +42,12 @@ class Comparison:
 
 
 def drifts_by_setting(sweep: Sweep, score: str = "drift") -> Drifts:
-    """The mean test drift of the runs that count, those that have one; with ``val_drift`` validation's."""
+    """The drifts of the finished runs by setting and seed; runs without this score are left out.
+
+    Args:
+        sweep: the runs.
+        score: ``drift``, the mean over the test sequences, or ``val_drift``, that of validation.
+    """
     return {
         setting: {seed: drift for seed, run in runs.items() if (drift := run.metrics.scores[score])}
         for setting, runs in sweep.by_setting.items()
@@ -49,18 +55,22 @@ def drifts_by_setting(sweep: Sweep, score: str = "drift") -> Drifts:
 
 
 def reference_setting(sweep: Sweep, wanted: Sequence[str] = ()) -> tuple[Values, str]:
-    """The setting that the others are compared with, and in words why it is this one.
+    """Chooses the setting that the others are compared with.
 
     Args:
-        sweep: with at least one setting.
-        wanted: ``KEY=VALUE`` of swept options that single it out; without any it is the first setting with
-            the paper's network, if that was swept, else the first; of those that have a drift.
+        sweep: a sweep with at least one setting.
+        wanted: texts ``KEY=VALUE`` of swept options that match exactly one setting. Without any, the
+            reference is the first setting with a drift that has the paper's network (if the sweep varies the
+            network), otherwise the first setting with a drift.
+
+    Returns:
+        The setting, and in words why it was chosen.
 
     Raises:
-        InputError: no setting has these values, or several have.
+        InputError: no setting, or more than one, has the wanted values.
     """
     if wanted:
-        return _chosen(sweep, wanted), "chosen by --reference"
+        return _find_setting(sweep, wanted), "chosen by --reference"
     settings = list(sweep.by_setting)
     swept = NETWORK.keys() & sweep.options
     papers = [
@@ -74,13 +84,14 @@ def reference_setting(sweep: Sweep, wanted: Sequence[str] = ()) -> tuple[Values,
     return reference, "the paper's choice" if reference in papers else "the first that has a drift"
 
 
-def _chosen(sweep: Sweep, wanted: Sequence[str]) -> Values:
+def _find_setting(sweep: Sweep, wanted: Sequence[str]) -> Values:
+    """The only setting that has all wanted values; raises InputError if there is none, or more than one."""
     pairs = [parse_choice(text) for text in wanted]
     short = {option.rsplit(".", 1)[-1]: option for option in sweep.options}
     found = []
     for setting in sweep.by_setting:
         values = dict(zip(sweep.options, setting, strict=True))
-        if all(matches(values, short.get(key, key), value) for key, value in pairs):
+        if all(has_value(values, short.get(key, key), value) for key, value in pairs):
             found.append(setting)
     if len(found) != 1:
         several = "several settings have it" if found else "no setting has it"
@@ -89,11 +100,11 @@ def _chosen(sweep: Sweep, wanted: Sequence[str]) -> Values:
     return found[0]
 
 
-def compare(drifts: Mapping[Values, Mapping[int, float]], reference: Values) -> list[Comparison]:
-    """Each setting against the reference, all in one family for Holm's adjustment.
+def compare_settings(drifts: Mapping[Values, Mapping[int, float]], reference: Values) -> list[Comparison]:
+    """Compares each setting with the reference; Holm's adjustment takes all comparisons together.
 
     Args:
-        drifts: by setting and seed.
+        drifts: drifts (ratios) by setting and seed.
         reference: one of the settings.
     """
     others = [setting for setting in drifts if setting != reference]
@@ -105,10 +116,10 @@ def compare(drifts: Mapping[Values, Mapping[int, float]], reference: Values) -> 
     ]
 
 
-def result(sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]) -> str:
-    """The outcome in some sentences; what is best is decided by validation, never by the test sequences."""
+def result_text(sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]) -> str:
+    """Describes the result in a few sentences; validation chooses the best setting, not the test drift."""
     if not comparisons:
-        return "There is one setting, and nothing to compare it with."
+        return "There is only one setting, so there is nothing to compare."
     validation, test = drifts_by_setting(sweep, "val_drift"), drifts_by_setting(sweep)
     means = {setting: fmean(runs.values()) for setting, runs in validation.items() if runs}
     best = min(means, key=lambda setting: means[setting], default=None)
@@ -121,15 +132,19 @@ def result(sweep: Sweep, reference: Values, comparisons: Sequence[Comparison]) -
             f"{seeds}. Its mean test drift is {drift}."
         )
     if not _has_repeats(sweep):
-        return " ".join([*lines, "No setting has two seeds, and one seed shows no difference."])
+        return " ".join([*lines, "No setting has two seeds, and one seed cannot show a difference."])
     if best == reference:
         lines.append("It is the reference.")
     against = escape(sweep.label(reference))
     lines += [
-        f"Against the reference, {against}: {one.verdict}." for one in comparisons if one.setting == best
+        f"Compared with the reference, {against}: {each.verdict}."
+        for each in comparisons
+        if each.setting == best
     ]
-    shown = sum(one.verdict in ("lower drift", "higher drift") for one in comparisons)
-    lines.append(f"Shown to differ from the reference in test drift: {shown} of {len(comparisons)}.")
+    shown = sum(each.verdict in ("lower drift", "higher drift") for each in comparisons)
+    lines.append(
+        f"A difference from the reference in test drift is shown for {shown} of {len(comparisons)} settings."
+    )
     return " ".join(lines)
 
 
@@ -138,30 +153,32 @@ def _has_repeats(sweep: Sweep) -> bool:
 
 
 def difference_section(sweep: Sweep, reference: Values, why: str, comparisons: Sequence[Comparison]) -> str:
-    """Comparisons with intervals and verdicts, and what they mean; empty without a repeated setting."""
+    """The table of comparisons with intervals and verdicts, explained; empty if no setting has two seeds."""
     if not comparisons or not _has_repeats(sweep):
         return ""
     label = escape(sweep.label(reference))
     header = ["setting", "verdict", "seeds", "ratio", f"{LEVEL:.0%} interval", "p", "p (Holm)"]
     lines = [
         "## Differences",
-        f"In test drift, against the reference **{label}** ({escape(why)}).",
-        markdown_table(header, [_difference_row(sweep, one) for one in comparisons], words=2),
-        "Ratio: drift of the setting over that of the reference, 0.90 is a tenth less. It is the geometric "
-        "mean over the seeds that both have, with the interval and p of a t test on the logarithms, paired "
-        f"by seed. A difference counts as shown when p, adjusted by Holm's method for {len(comparisons)} "
+        f"Differences in test drift from the reference **{label}** ({escape(why)}).",
+        markdown_table(header, [_difference_row(sweep, each) for each in comparisons], words=2),
+        "The ratio is the drift of the setting divided by that of the reference; 0.90 is a tenth less. It is "
+        "the geometric mean over the common seeds. The interval and p come from a t test on the logarithms, "
+        f"paired by seed. A difference is shown if p, adjusted by Holm's method for {len(comparisons)} "
         f"comparison{'s' * (len(comparisons) > 1)}, is below {1 - LEVEL:.2f}; the interval is not adjusted. "
         f"*{NO_DIFFERENCE.capitalize()}* does not mean equal: the wider the interval, the less is known.",
-        "Seeds vary initial weights and the order of batches; training and test drives are the same in every "
-        "run, so all this speaks of these drives only.",
+        "Seeds vary the initial weights and the order of batches. The training and test drives are the same "
+        "in every run, so these results are valid only for these drives.",
     ]
-    if any(one.verdict == NO_DIFFERENCE and (one.ratio.p or 0) < 1 - LEVEL for one in comparisons):
+    if any(each.verdict == NO_DIFFERENCE and (each.ratio.p or 0) < 1 - LEVEL for each in comparisons):
         lines.append(
-            f"An interval that leaves out 1 beside *{NO_DIFFERENCE}* would count if it had been the only "
-            "comparison; one among several can come about by chance."
+            f"Some intervals with *{NO_DIFFERENCE}* exclude 1. With a single comparison such an interval "
+            "would show a difference, but among several comparisons it can occur by chance."
         )
     if len(sweep.options) > 1:
-        lines.append("Several options were swept: a comparison is one of whole combinations.")
+        lines.append(
+            "Several options were swept, so each comparison is between whole combinations of their values."
+        )
     return "\n\n".join(lines)
 
 

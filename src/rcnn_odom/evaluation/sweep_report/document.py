@@ -1,4 +1,4 @@
-"""A report as files, Markdown with its figures beside it and HTML in one, and tables and text in them."""
+"""Writes a report as Markdown with separate figures and as one HTML file; formats its tables and texts."""
 
 import base64
 import html
@@ -12,14 +12,14 @@ from rcnn_odom.files import write_atomically
 
 MARKDOWN, HTML, FIGURES = "report.md", "report.html", "report_figures"
 MARK = "rcnn-odom report"
-"""Written into every file of a report, by which it is known as one."""
+"""Text in every file of a report, by which a later report recognises the file and may overwrite it."""
 
 Row = Sequence[str]
 DASH = "-"
 
-_PLAIN = re.compile(r"[\w.,=:/+@%()\[\] -]+")
-_SPECIAL = re.compile(r"[&<>\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])")
-"""What Markdown or HTML would take for markup; an underscore within a word is none."""
+_CODE_TEXT = re.compile(r"[\w.,=:/+@%()\[\] -]+")
+_MARKUP = re.compile(r"[&<>\\`*\[\]|~$]|(?<![^\W_])_|_(?![^\W_])")
+"""Characters that Markdown or HTML read as markup; an underscore within a word is not one of them."""
 
 STYLE = """
 :root { color-scheme: light dark; --ink: #1c1f23; --paper: #ffffff; --line: #d5d9de; --soft: #f4f6f8;
@@ -46,37 +46,37 @@ img { max-width: 100%; height: auto; background: #ffffff; border-radius: 4px; }
 
 
 def image(name: str, alt: str) -> str:
-    """Markdown of one of the report's figures."""
+    """Markdown that shows one of the report's figures."""
     return f"![{alt}]({FIGURES}/{name}.png)"
 
 
 def write_report(directory: Path, title: str, text: str, figures: Mapping[str, bytes]) -> tuple[Path, Path]:
-    """Writes ``report.md``, ``report.html`` and ``report_figures``, each file at once or not at all.
+    """Writes ``report.md``, ``report.html`` and ``report_figures``, each file atomically.
 
     Args:
         directory: the folder of the runs.
-        title: plain text.
-        text: Markdown.
-        figures: PNG files by the names that :func:`image` was given.
+        title: title of the HTML page, plain text.
+        text: the report as Markdown.
+        figures: contents of the PNG files by the names that :func:`image` got.
 
     Returns:
-        Paths of the Markdown and of the HTML.
+        Paths of the Markdown file and of the HTML file.
 
     Raises:
-        InputError: a file of one of these names was not written by this command.
+        InputError: a file with one of these names exists and was not written by this command.
     """
     contents = {f"{FIGURES}/{name}.png": content for name, content in figures.items()}
     contents[MARKDOWN] = f"<!-- {MARK} -->\n{text}\n".encode()
     contents[HTML] = to_html(title, text, figures).encode()
     for name in contents:
-        _need_own(directory / name)
+        _check_replaceable(directory / name)
     for name, content in contents.items():
         write_atomically(directory / name, content)
     return directory / MARKDOWN, directory / HTML
 
 
 def to_html(title: str, text: str, figures: Mapping[str, bytes]) -> str:
-    """The report as one page that needs no other file."""
+    """Converts the report to a single HTML page that contains its figures."""
     from markdown import markdown
 
     body = markdown(text, extensions=["tables", "sane_lists"])
@@ -92,32 +92,46 @@ def to_html(title: str, text: str, figures: Mapping[str, bytes]) -> str:
     )
 
 
-def _need_own(path: Path) -> None:
-    """A file of this name may be replaced if it is from an earlier report."""
+def _check_replaceable(path: Path) -> None:
+    """Checks that a file does not exist or belongs to an earlier report, so that it may be replaced.
+
+    Raises:
+        InputError: it is another file.
+    """
     if path.exists() and MARK.encode() not in path.read_bytes()[:1000]:
-        raise InputError(f"{path}: was not written by rcnn-odom report; move it away, then try again")
+        raise InputError(f"{path}: was not written by rcnn-odom report; move it away and try again")
 
 
 def escape(text: object) -> str:
-    """Any text so that Markdown and HTML show it as it is, on one line, also in a cell of a table."""
+    """Escapes a text so that Markdown and HTML show it unchanged, on one line, also in a table cell.
+
+    Example:
+        >>> escape("a_b *c*")
+        'a_b &#42;c&#42;'
+    """
     line = " ".join(str(text).split())
-    # An entity means the same to all readers, unlike a backslash before a character that needs none.
-    return _SPECIAL.sub(lambda found: f"&#{ord(found[0])};", line)
+    # All Markdown readers agree on entities, but not on a backslash before a character that needs none.
+    return _MARKUP.sub(lambda found: f"&#{ord(found[0])};", line)
 
 
 def code(text: object) -> str:
-    """A name or a command as code; escaped text where it holds what could end the code."""
-    return f"`{text}`" if _PLAIN.fullmatch(str(text)) and str(text).strip() == str(text) else escape(text)
+    """Formats a name or a command as code; escaped text if a character could end the code.
+
+    Example:
+        >>> code("model.beta=1"), code("a`b")
+        ('`model.beta=1`', 'a&#96;b')
+    """
+    return f"`{text}`" if _CODE_TEXT.fullmatch(str(text)) and str(text).strip() == str(text) else escape(text)
 
 
 def markdown_table(header: Row, rows: Sequence[Row], words: int = 1, names: Row = ()) -> str:
-    """A table in Markdown; the first ``words`` columns to the left, numbers after them to the right.
+    """Formats a table in Markdown: columns of words to the left, columns of numbers to the right.
 
     Args:
-        header: of the columns, plain text.
-        rows: cells, plain text.
-        words: how many columns hold words.
-        names: headings of columns that hold names, which are shown as code.
+        header: headings of the columns, plain text.
+        rows: cells of each row, plain text.
+        words: number of columns with words; they come first.
+        names: headings of the columns with names, which are shown as code.
     """
     show = [code if name in names else escape for name in header]
     body = [
@@ -129,17 +143,27 @@ def markdown_table(header: Row, rows: Sequence[Row], words: int = 1, names: Row 
 
 
 def text_table(header: Row, rows: Sequence[Row]) -> str:
-    """The same for a terminal."""
+    """Formats a table for a terminal."""
     return aligned([[" ".join(cell.split()) for cell in row] for row in (header, *rows)])
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number with so many decimals; a dash for None and nan."""
+    """Formats a number with ``digits`` decimals; a dash for None and nan.
+
+    Example:
+        >>> number(0.1234), number(None)
+        ('0.12', '-')
+    """
     return DASH if value is None or value != value else f"{value:.{digits}f}"
 
 
 def duration(seconds: float | None) -> str:
-    """A time for people."""
+    """Formats a time in seconds, minutes or hours; a dash for None and nan.
+
+    Example:
+        >>> duration(3725)
+        '1 h 02 min'
+    """
     if seconds is None or seconds != seconds:
         return DASH
     minutes, rest = divmod(round(seconds), 60)

@@ -1,4 +1,4 @@
-"""The report's figures, and the sections that are made of them."""
+"""The figures of the report, and the sections that consist of figures."""
 
 import io
 from collections.abc import Mapping, Sequence
@@ -19,18 +19,23 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#000000", "#56b4e9", "#e69f00")
-"""Okabe and Ito's, which people with any colour vision tell apart; without yellow, pale on white."""
+"""Okabe and Ito's colours, distinct for all kinds of colour vision; without yellow, too pale on white."""
 MARKERS = "osD^vPX*"
 
-MOST_BANDS = 4
-"""Settings up to which their scatter is drawn; of more the bands would hide each other."""
+MAX_BANDS = 4
+"""Largest number of settings whose scatter is drawn as bands; more bands would hide each other."""
 
-LEAST_SEGMENTS = 3
-"""Fewer make no point of a curve, as in KITTI's devkit."""
+MIN_SEGMENTS = 3
+"""Smallest number of segments for a point of a curve, as in KITTI's devkit."""
 
 
 def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
-    """Drift against the length of a segment; adds the figure. Empty where no run has enough segments."""
+    """The section on drift against segment length; empty if no run has enough segments.
+
+    Args:
+        sweep: the runs.
+        figures: contents of the PNG files by name; the figure of this section is added.
+    """
     curves = {
         sweep.label(setting): found
         for setting, runs in sweep.by_setting.items()
@@ -43,30 +48,35 @@ def curves_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
         [
             "## Drift against length",
             image("length", "translation and rotation error against the length of the segment"),
-            "Means over all segments, whatever sequence they are of. A line is the mean over seeds; a band, "
-            f"drawn for up to {MOST_BANDS} settings, reaches from the lowest to the highest seed. "
-            f"{LEAST_SEGMENTS} segments at least make a point.",
+            "Means over the segments of all sequences. A line is the mean over seeds. With up to "
+            f"{MAX_BANDS} settings, a band extends from the lowest to the highest seed. Each point has at "
+            f"least {MIN_SEGMENTS} segments.",
         ]
     )
 
 
 def length_curve(run: Run) -> FloatArray:
-    """Rows of length in metres, translation error in percent, rotation error in degrees per metre, (P, 3)."""
+    """Errors by segment length, (P, 3): metres, translation error in percent, rotation error in deg/m."""
     rows = [
         (length, 100 * t_err, r_err)
         for length, (segments, t_err, r_err) in sorted(run.metrics.by_length.items())
-        if segments >= LEAST_SEGMENTS
+        if segments >= MIN_SEGMENTS
     ]
     return np.array(rows).reshape(-1, 3)
 
 
 def trajectories_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
-    """Trajectories of one run of each setting; adds the figures."""
+    """The section with the trajectories of one run of each setting; empty if there is no run.
+
+    Args:
+        sweep: the runs.
+        figures: contents of the PNG files by name; the figures of this section are added.
+    """
     lines = []
     for place, (setting, runs) in enumerate(sweep.by_setting.items(), start=1):
         if not runs:
             continue
-        run = middle_run(list(runs.values()))
+        run = median_run(list(runs.values()))
         drift = percent(run.metrics.scores["drift"])
         title = f"{sweep.label(setting)}, seed {run.settings['seed']}, mean drift {drift} %"
         try:
@@ -75,27 +85,27 @@ def trajectories_section(sweep: Sweep, figures: dict[str, bytes]) -> str:
                 for name in run.metrics.sequences
             }
         except InputError as error:
-            lines.append(f"Not drawn, {code(run.name)}: {escape(error)}")
+            lines.append(f"The trajectories of {code(run.name)} are missing: {escape(error)}")
             continue
         figures[f"trajectories_{place}"] = png(trajectories_figure(title, panels))
         lines.append(f"{escape(title)} ({code(run.name)}):")
-        lines.append(image(f"trajectories_{place}", "trajectories over the truth, seen from above"))
-    words = "Of each setting the run of median validation drift, so that no test drift chooses what is shown."
+        lines.append(image(f"trajectories_{place}", "estimated and true trajectories, seen from above"))
+    words = "For each setting, the run with the median validation drift; the test drift has no influence."
     return "\n\n".join(["## Trajectories", words, *lines]) if lines else ""
 
 
-def middle_run(runs: Sequence[Run]) -> Run:
-    """The run of median validation drift, of two in the middle the better; without any just one of them."""
+def median_run(runs: Sequence[Run]) -> Run:
+    """The run with the median validation drift (the better of two in the middle), or any if none has one."""
     drifts = {run: run.metrics.scores["val_drift"] for run in runs}
     known = sorted((run for run in runs if drifts[run] is not None), key=drifts.__getitem__) or runs
     return known[(len(known) - 1) // 2]
 
 
 def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
-    """True and estimated places of a test sequence, (N, 2) metres to the right and ahead of the start.
+    """Reads the true and the estimated positions, (N, 2) metres to the right and ahead of the start.
 
     Raises:
-        InputError: a file is not there or not a trajectory.
+        InputError: a file is missing or does not contain a trajectory.
     """
     names = (f"{file_name(sequence)}_truth.txt", f"{file_name(sequence)}.txt")
     truth, estimate = (flatten(read_kitti(run.folder / "trajectories" / name)) for name in names)
@@ -104,17 +114,18 @@ def trajectory(run: Run, sequence: str) -> tuple[FloatArray, FloatArray]:
 
 
 def png(figure: "Figure") -> bytes:
-    """A figure as the content of a PNG file."""
+    """Converts a figure to the content of a PNG file."""
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", dpi=120, metadata={"Software": MARK})
     return buffer.getvalue()
 
 
 def drift_figure(drifts: Mapping[str, Mapping[int, float]]) -> "Figure":
-    """The mean test drift of every run, and of each setting the mean.
+    """The mean test drift of every run, and the mean of each setting.
 
     Args:
-        drifts: ratio by seed, by the label of the setting; settings without a run show nothing.
+        drifts: drifts (ratios) by the label of the setting and then by seed; the row of a setting without a
+            run stays empty.
     """
     figure, axes = new_figure(8, 1.4 + 0.45 * len(drifts))
     seeds = sorted({seed for runs in drifts.values() for seed in runs})
@@ -127,7 +138,7 @@ def drift_figure(drifts: Mapping[str, Mapping[int, float]]) -> "Figure":
         axes.plot(*zip(*points, strict=True), linestyle="", label=f"seed {seed}", alpha=0.85, **_style(index))
     axes.plot([], [], color="black", linewidth=2.5, label="mean")
     axes.set(xlabel="mean drift of the test sequences (%)", ylim=(len(drifts) - 0.5, -0.5))
-    axes.set_yticks(range(len(drifts)), list(map(_plain, drifts)))
+    axes.set_yticks(range(len(drifts)), list(map(_escape_math, drifts)))
     axes.set_xlim(left=0)
     axes.grid(axis="x", alpha=0.3)
     axes.legend(loc="center left", bbox_to_anchor=(1, 0.5), frameon=False)
@@ -138,7 +149,7 @@ def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
     """Translation and rotation error against the length of a segment, a line for each setting.
 
     Args:
-        curves: of the seeds, each of :func:`length_curve`, by the label of the setting.
+        curves: by the label of the setting, the curves of its seeds from :func:`length_curve`.
     """
     figure, panels = new_figure(11, 4.4 + 0.18 * max(0, len(curves) - 3), ncols=2)
     for index, (label, runs) in enumerate(curves.items()):
@@ -146,8 +157,10 @@ def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
         lengths = np.unique(rows[:, 0])
         for column, axes in enumerate(panels, start=1):
             seeds = [rows[rows[:, 0] == length, column] for length in lengths]
-            axes.plot(lengths, list(map(np.mean, seeds)), label=_plain(label), linewidth=1.6, **_style(index))
-            if len(curves) <= MOST_BANDS:
+            axes.plot(
+                lengths, list(map(np.mean, seeds)), label=_escape_math(label), linewidth=1.6, **_style(index)
+            )
+            if len(curves) <= MAX_BANDS:
                 low, high = list(map(np.min, seeds)), list(map(np.max, seeds))
                 axes.fill_between(lengths, low, high, color=_style(index)["color"], alpha=0.13, linewidth=0)
     for axes, name in zip(
@@ -156,30 +169,30 @@ def curves_figure(curves: Mapping[str, Sequence[FloatArray]]) -> "Figure":
         axes.set(xlabel="length of the segment (m)", ylabel=name)
         axes.grid(alpha=0.3)
         axes.set_ylim(bottom=0)
-    columns = max(1, min(len(curves), 4, 120 // (max(map(len, curves)) + 8)))  # as many as fit side by side
+    columns = max(1, min(len(curves), 4, 120 // (max(map(len, curves)) + 8)))  # as many as fit in one row
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=columns)
     return figure
 
 
 def trajectories_figure(title: str, panels: Mapping[str, tuple[FloatArray, FloatArray]]) -> "Figure":
-    """Trajectories of one run over the truth, a panel for each sequence.
+    """Estimated and true trajectories of one run, with a panel for each sequence.
 
     Args:
-        title: above all of them.
-        panels: true and estimated places, see :func:`trajectory`, by the panel's title.
+        title: above all panels.
+        panels: true and estimated positions, see :func:`trajectory`, by the title of the panel.
     """
     figure, axes = new_figure(max(4.6 * len(panels), 7), 4.6, ncols=len(panels), squeeze=False)
-    figure.suptitle(_plain(title), fontweight="bold")
-    for one, (name, pair) in zip(axes[0], panels.items(), strict=True):
-        draw_trajectory(one, _plain(name), *pair)
+    figure.suptitle(_escape_math(title), fontweight="bold")
+    for panel, (name, pair) in zip(axes[0], panels.items(), strict=True):
+        draw_trajectory(panel, _escape_math(name), *pair)
     return figure
 
 
-def _plain(text: str) -> str:
-    """Text in which a dollar sign begins no formula."""
+def _escape_math(text: str) -> str:
+    """Escapes dollar signs, with which matplotlib starts a formula."""
     return text.replace("$", r"\$")
 
 
 def _style(index: int) -> dict[str, Any]:
-    """Colours and markers with numbers of elements that share no divisor, so that few pairs repeat."""
+    """Colour and marker of a curve; the numbers of both have no common divisor, so that pairs repeat late."""
     return {"color": COLOURS[index % len(COLOURS)], "marker": MARKERS[index % len(MARKERS)]}

@@ -1,4 +1,4 @@
-"""Run folders below a folder: which there are, and how each of them ended."""
+"""Finds and reads the run folders below a folder, and determines how each run ended."""
 
 import os
 import re
@@ -26,26 +26,26 @@ from rcnn_odom.evaluation.run_folder import (
 )
 
 Scores = dict[str, Any]
-"""Of one run or method; None for what is not known."""
+"""The scores of one run or method by name; None for a score that is not known."""
 
-OVERRIDES, HYDRA = ".hydra/overrides.yaml", ".hydra/hydra.yaml"
+OVERRIDES_FILE, HYDRA_FILE = ".hydra/overrides.yaml", ".hydra/hydra.yaml"
 
 
 @dataclass(frozen=True)
 class Metrics:
-    """The content of a ``metrics.json``; everything is empty for a run that is not finished.
+    """The content of a ``metrics.json``; all attributes are empty for a run that has not finished.
 
     Attributes:
         variant: name of the model.
         data: name of the data.
-        is_training: whether a training wrote it, and not ``evaluate.py``.
+        is_training: whether a training wrote the file; otherwise ``evaluate.py`` did.
         sequences: names of the test sequences.
-        by_length: of each length of a segment in metres: how many segments, and their mean translation error
-            (a ratio) and rotation error (degrees per metre).
-        scores: see :func:`_method_scores`; beside them ``val_drift`` (a ratio), ``latency_ms``, ``seconds``
-            of training and ``same_as``. What older runs do not say is None.
-        baselines: scores of each, by its name.
-        versions: of packages, by their names.
+        by_length: for each segment length in metres, the number of segments, their mean translation error (a
+            ratio) and their mean rotation error (degrees per metre).
+        scores: see :func:`_method_scores`; in addition ``val_drift`` (a ratio), ``latency_ms``, ``seconds``
+            of training and ``same_as``. Values that an older run did not store are None.
+        baselines: the scores of each baseline by its name.
+        versions: versions of the packages by name.
     """
 
     variant: str = ""
@@ -63,14 +63,14 @@ class Run:
     """One run folder.
 
     Attributes:
-        folder: where it is.
-        name: its path below the folder that was searched.
+        folder: path of the folder.
+        name: its path relative to the folder that was searched.
         status: ``finished``, ``unfinished``, ``failed`` or ``damaged``.
-        problem: why it is not finished, one line; empty for a finished run.
-        settings: its resolved configuration under dotted names, lists as tuples; empty where that cannot be
-            read.
-        overrides: what its command set.
-        metrics: what its ``metrics.json`` holds; empty unless finished.
+        problem: one line that says why it is not finished; empty for a finished run.
+        settings: its resolved configuration with dotted names and lists as tuples; empty if the
+            configuration cannot be read.
+        overrides: the options that its command set.
+        metrics: the content of its ``metrics.json``; empty unless the run is finished.
     """
 
     folder: Path
@@ -83,54 +83,68 @@ class Run:
 
     @property
     def is_evaluation(self) -> bool:
-        """Scores without a training of its own, by ``evaluate.py``."""
+        """Whether it is a finished scoring by ``evaluate.py``, without a training of its own."""
         return self.status == "finished" and not self.metrics.is_training
 
 
 def find_runs(directory: Path) -> list[Run]:
-    """Every run folder below a folder, in the order of their names, numbers in order of their value.
+    """Finds all run folders below a folder, sorted by :func:`natural_order` of their names.
 
-    Links (``latest``) are not followed, and a run's own ``first_stage`` is a part of that run. An evaluation
-    that did not finish is nothing.
+    Links (``latest``) are not followed. The ``first_stage`` of a run belongs to that run. An evaluation that
+    did not finish is left out.
 
     Raises:
-        InputError: no such folder, or it is a run's own.
+        InputError: there is no such folder, or it is the folder of a single run.
     """
     if not directory.is_dir():
-        raise InputError(f"{directory}: no such folder; name a sweep's, outputs/multirun/... , or outputs")
+        raise InputError(
+            f"{directory}: no such folder; name the folder of a sweep, outputs/multirun/..., or outputs"
+        )
     if _is_run(directory):
-        raise InputError(f"{directory}: is the folder of one run; name the folder of several around it")
+        raise InputError(
+            f"{directory}: this is the folder of one run; name a folder that contains several runs"
+        )
     found = []
     for path, subfolders, _ in os.walk(directory):
         folder = Path(path)
         if folder != directory and _is_run(folder) and not (folder / CONFIG).is_symlink():
             subfolders.clear()
-            evaluates = hydras(folder / HYDRA, "hydra", "job", "name") == "evaluate"
+            evaluates = read_hydra_value(folder / HYDRA_FILE, "hydra", "job", "name") == "evaluate"
             if (folder / METRICS).exists() or not evaluates:
                 found.append(read_run(folder, folder.relative_to(directory).as_posix()))
     return sorted(found, key=lambda run: natural_order(run.name))
 
 
 def natural_order(text: str) -> list[tuple[int, int, str]]:
-    """A sort key by which ``run 9`` comes before ``run 10``."""
+    """A sort key that compares numbers in a text by value, so that ``run 9`` comes before ``run 10``.
+
+    Example:
+        >>> sorted(["run 10", "run 9"], key=natural_order)
+        ['run 9', 'run 10']
+    """
     parts = re.findall(r"[0-9]+|[^0-9]+", text)
     return [(0, int(part), "") if part.isdecimal() else (1, 0, part) for part in parts]
 
 
 def _is_run(folder: Path) -> bool:
-    return any((folder / name).exists() for name in (CONFIG, METRICS, ERROR, OVERRIDES))
+    return any((folder / name).exists() for name in (CONFIG, METRICS, ERROR, OVERRIDES_FILE))
 
 
-def hydras(path: Path, *keys: str) -> Any:
-    """A part of a file that Hydra left; None where it is not there."""
+def read_hydra_value(path: Path, *keys: str) -> Any:
+    """Reads a value from a YAML file that Hydra wrote; None if the file or the value is missing.
+
+    Args:
+        path: path of the file.
+        keys: keys of the nested dictionaries that lead to the value.
+    """
     with suppress(OSError, yaml.YAMLError, UnicodeDecodeError, KeyError, TypeError):
         return reduce(getitem, keys, yaml.safe_load(path.read_text(encoding="utf-8")))
     return None
 
 
 def read_run(folder: Path, name: str) -> Run:
-    """A run from its folder; nothing that is wrong with it raises, its status says it."""
-    overrides = hydras(folder / OVERRIDES)
+    """Reads a run from its folder. A damaged run raises nothing: ``status`` and ``problem`` describe it."""
+    overrides = read_hydra_value(folder / OVERRIDES_FILE)
     overrides = tuple(map(str, overrides)) if isinstance(overrides, list) else ()
     run = Run(folder, name, "unfinished", "", {}, overrides)
     finished = has_finished(folder)
@@ -151,24 +165,29 @@ def read_run(folder: Path, name: str) -> Run:
         problem = " ".join((folder / ERROR).read_text(encoding="utf-8", errors="replace").split())
         return replace(run, status="failed", problem=problem or f"{ERROR} is empty")
     if reason := stopped_by(folder):
-        return replace(run, problem=f"stopped by {reason}; the same command goes on")
+        return replace(run, problem=f"stopped by {reason}; the same command continues it")
     ended = "stopped, or still running" if run.settings else f"ended before its {CONFIG} was written"
     return replace(run, problem=f"no {METRICS}: {ended}")
 
 
 def _read_finished(run: Run) -> Run:
+    """Adds the metrics to a run that has finished; the result is damaged if they cannot be read."""
     if not run.settings:
         return replace(run, status="damaged", problem=f"{CONFIG} is missing")
     try:
         metrics = _read_metrics(read_metrics_file(run.folder))
     except (OSError, ValueError, KeyError, TypeError, AttributeError, ZeroDivisionError) as error:
-        what = f"{METRICS} cannot be read, or lacks what a finished run has"
+        what = f"{METRICS} cannot be read, or is incomplete"
         return replace(run, status="damaged", problem=f"{what} ({type(error).__name__}: {error})")
     return replace(run, status="finished", metrics=metrics)
 
 
 def _read_metrics(content: Report) -> Metrics:
-    """Raises KeyError, TypeError, ValueError, AttributeError or ZeroDivisionError for another form."""
+    """Converts the content of a ``metrics.json``.
+
+    Raises:
+        KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError: the content has another form.
+    """
     test, latency, training = content["test"], content.get("latency") or {}, content.get("training") or {}
     others = {
         "val_drift": _number((content.get("val") or {}).get("drift")),
@@ -181,15 +200,23 @@ def _read_metrics(content: Report) -> Metrics:
         str(content["data"]),
         "seed" in content,
         tuple(test["sequences"]),
-        {length: _of_length(test, f"{length:g}") for length in map(float, test["lengths"])},
+        {length: _length_errors(test, f"{length:g}") for length in map(float, test["lengths"])},
         _method_scores(test) | others,
         {name: _method_scores(report) for name, report in content.get("baselines", {}).items()},
         {name: str(version) for name, version in (content.get("versions") or {}).items()},
     )
 
 
-def _of_length(test: Report, length: str) -> tuple[int, float, float]:
-    """Number of segments, translation and rotation error, over the segments of all sequences."""
+def _length_errors(test: Report, length: str) -> tuple[int, float, float]:
+    """Errors over the segments of one length of all sequences.
+
+    Args:
+        test: ``test`` of a ``metrics.json``.
+        length: the length in metres as a key of ``per_length``.
+
+    Returns:
+        Number of segments, mean translation error (a ratio) and mean rotation error (degrees per metre).
+    """
     drifts = [one["drift"].get("per_length", {}).get(length) for one in test["sequences"].values()]
     parts = [part for part in drifts if part]
     segments = sum(part["segments"] for part in parts)
@@ -201,18 +228,18 @@ def _of_length(test: Report, length: str) -> tuple[int, float, float]:
 
 
 def _method_scores(report: Report) -> Scores:
-    """Every metric of a method over its test sequences, and its drift by sequence.
+    """All metrics of a method over its test sequences, and its drift on each sequence.
 
     Args:
-        report: ``test`` of a ``metrics.json``, or one of its ``baselines``; without ``metrics`` where an
-            older version wrote it.
+        report: ``test`` of a ``metrics.json``, or one of its ``baselines``. A report of an older version has
+            no ``metrics``; they are then computed from its sequences.
 
     Returns:
-        The metrics in their stored units, ``floor``, and ``drift_NAME`` and ``floor_NAME`` of each sequence,
-        ratios. None where no segment was long enough.
+        The metrics in their stored units; ``floor``; and ``drift_NAME`` and ``floor_NAME`` of each sequence
+        as ratios, None if no segment was long enough.
 
     Raises:
-        KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError: the report is not of that form.
+        KeyError, TypeError, ValueError, AttributeError, ZeroDivisionError: the report has another form.
     """
     sequences = report["sequences"]
     metrics = report["metrics"] if "metrics" in report else combine(sequences.values(), BUILT_IN)
@@ -228,7 +255,7 @@ def _number(value: Any) -> float | None:
 
 
 def first_stage_seconds(run: Run) -> float | None:
-    """How long the first stage was trained, where that was done within the run."""
+    """Training time of the first stage in seconds; None if the run did not train a first stage itself."""
     with suppress(OSError, ValueError, KeyError, TypeError):
         return float(read_metrics_file(run.folder / "first_stage")["training"]["seconds"])
     return None

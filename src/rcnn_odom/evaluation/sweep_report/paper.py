@@ -1,5 +1,5 @@
-"""What the paper says, word for number: Valente, Joly and de La Fortelle, *An LSTM Network for Real-Time
-Odometry Estimation*, 2019."""
+"""Results and claims of the paper: Valente, Joly and de La Fortelle, *An LSTM Network for Real-Time Odometry
+Estimation*, 2019."""
 
 from dataclasses import dataclass
 
@@ -9,9 +9,9 @@ class PaperColumn:
     """A column of the paper's table II.
 
     Attributes:
-        name: its heading.
-        drift: of the test sequences, and their mean, as ratios.
-        seconds: a frame, without a GPU.
+        name: heading of the column.
+        drift: drifts of the two test sequences and their mean, as ratios.
+        seconds: computing time of a frame without a GPU.
     """
 
     name: str
@@ -20,7 +20,7 @@ class PaperColumn:
 
 
 SEQUENCES = ("05", "07")
-"""The paper's test sequences, of KITTI's odometry benchmark."""
+"""The paper's test sequences of KITTI's odometry benchmark."""
 
 VARIANTS = {
     "cnn_reg": PaperColumn("CNN-Regression", (0.2888, 0.1281, 0.2084), 0.005),
@@ -28,22 +28,21 @@ VARIANTS = {
     "rcnn_reg": PaperColumn("RCNN-Regression", (0.0293, 0.0218, 0.0255), 0.015),
     "rcnn_cls": PaperColumn("RCNN-Classification", (0.2488, 0.1251, 0.1869), 0.015),
 }
-"""Table II, its own networks by the name of the variant here."""
+"""Networks of the paper in table II, by the name of the variant in this project."""
 
 COMPARED_METHODS = (
     PaperColumn("DeepVO (one camera)", (0.0262, 0.0391, 0.0326), 1.0),
     PaperColumn("3D LiDAR CNN (Velas et al.)", (0.0235, 0.0177, 0.0206), 0.7),
 )
-"""Table II, the methods that it compares with."""
+"""Methods in table II that the paper compares its networks with."""
 
 NETWORK = {"model.kernel_size": 3, "model.pooling": "avg"}
-"""Options of its convolutional network (table I and section III-B), for which table II is."""
-
+"""Options of the convolutional network of the paper (table I, section III-B); table II has its results."""
 
 TABLE_NOTE = (
     'The paper\'s figures are its table II, on real KITTI. Its caption calls them "RMSE translation drift" '
     "and times them without GPU acceleration; it adds that the 3D LiDAR CNN was trained on these sequences. "
-    "Ours are means over segments, as KITTI's devkit takes them."
+    "Ours are means over segments, by the rule of KITTI's devkit."
 )
 
 CLAIMS = {
@@ -56,9 +55,9 @@ CLAIMS = {
         "III-B); it gives no figures for them."
     ),
 }
-"""What it says in words, by the option that it is about."""
+"""Claims of the paper in words, by the option that they are about."""
 
 FRAME_ERRORS_NOTE = (
-    "The paper (section IV) has over its two real sequences a mean absolute error of 0.02 m and 0.05 degrees "
-    "a frame, and errors up to 0.2 m and 0.4 degrees."
+    "The paper (section IV) reports for its two real sequences a mean absolute error of 0.02 m and 0.05 "
+    "degrees per frame, and errors up to 0.2 m and 0.4 degrees."
 )

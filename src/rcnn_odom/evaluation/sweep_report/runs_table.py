@@ -1,4 +1,4 @@
-"""The table of a sweep's runs."""
+"""Reads the runs of a sweep and makes a table of them."""
 
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -12,8 +12,8 @@ from rcnn_odom.evaluation.sweep_report.folders import Run, find_runs, first_stag
 from rcnn_odom.evaluation.sweep_report.options import (
     Values,
     check_same_data,
-    choose,
     same_drives,
+    select_runs,
     setting_of,
     show_value,
     swept_options,
@@ -23,8 +23,8 @@ from rcnn_odom.evaluation.sweep_report.paper import VARIANTS
 if TYPE_CHECKING:
     import pandas as pd
 
-MISSING = "the last command for this folder asked for it, and there is no such folder"
-"""What is wrong with a missing run; what earlier commands asked for is not known."""
+MISSING = "the last command of the sweep should have made this folder, but it does not exist"
+"""Problem of a missing run. Runs that only earlier commands should have made are not known."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,12 @@ class Sweep:
     """The runs below a folder, read once.
 
     Attributes:
-        directory: that folder.
-        runs: trainings, whatever became of them.
-        missing: names of folders that the folder's last command asked for and that are not there.
-        evaluations: finished ones by ``evaluate.py`` on the same drives.
-        left_out: names of evaluations on other drives.
+        directory: the folder.
+        runs: all trainings, finished or not.
+        missing: names of the run folders that the last command of the sweep should have made and that do not
+            exist.
+        evaluations: finished evaluations by ``evaluate.py`` on the same drives.
+        left_out: names of the evaluations on other drives.
         options: full names of the swept options.
     """
 
@@ -59,19 +60,19 @@ class Sweep:
 
     @cached_property
     def by_setting(self) -> dict[Values, dict[int, Run]]:
-        """The finished runs by setting and seed; settings of which none has finished are there too.
+        """The finished runs by setting and then by seed; settings without a finished run are empty.
 
-        Where several have the same setting and seed one counts: it is one training, however often it was
-        run. It is the first that did not take its weights from another.
+        Several runs with the same setting and seed are the same training, so only one of them counts: the
+        first that did not take its weights from another run.
         """
         order = dict.fromkeys(setting_of(run, self.options) for run in self.runs if run.settings)
-        by_setting: dict[Values, dict[int, Run]] = {setting: {} for setting in _by_value(order)}
+        by_setting: dict[Values, dict[int, Run]] = {setting: {} for setting in _sort_settings(order)}
         for run in sorted(self.finished, key=lambda run: bool(run.metrics.scores["same_as"])):
             by_setting[setting_of(run, self.options)].setdefault(run.settings["seed"], run)
         return by_setting
 
     def label(self, setting: Values) -> str:
-        """A setting for people, ``rcnn_reg, kernel_size=5``; the variant alone where nothing was swept."""
+        """Label of a setting, for instance ``rcnn_reg, kernel_size=5``; the variant if nothing was swept."""
         if not self.options:
             variants = (run.settings.get("model.variant") for run in self.runs if run.settings)
             return ", ".join(dict.fromkeys(map(show_value, variants)))
@@ -83,45 +84,47 @@ class Sweep:
         return ", ".join(parts)
 
 
-def _by_value(settings: Iterable[Values]) -> list[Values]:
-    """Numbers in their order, variants in the paper's; other words in the order in which they came."""
-    come = {setting: place for place, setting in enumerate(settings)}
-    first = {value: place for setting, place in reversed(come.items()) for value in setting}
+def _sort_settings(settings: Iterable[Values]) -> list[Values]:
+    """Sorts settings: numbers by value, variants as in the paper, other texts by first appearance."""
+    places = {setting: place for place, setting in enumerate(settings)}
+    first = {value: place for setting, place in reversed(places.items()) for value in setting}
     first |= {variant: place for place, variant in enumerate(VARIANTS)}
 
-    def order(setting: Values) -> list[tuple[int, float]]:
+    def sort_key(setting: Values) -> list[tuple[int, float]]:
         numbers = [isinstance(value, int | float) and not isinstance(value, bool) for value in setting]
         return [
             (0, value) if number else (1, first[value])
             for value, number in zip(setting, numbers, strict=True)
         ]
 
-    return sorted(come, key=order)
+    return sorted(places, key=sort_key)
 
 
 def read_sweep(
     directory: str | Path, only: Sequence[str] = (), expected: Sequence[str] | None = None
 ) -> Sweep:
-    """Reads the runs below a folder, which need not come from one sweep.
+    """Reads the runs below a folder; they may come from several sweeps.
 
     Args:
-        directory: a sweep's folder, or any around runs.
-        only: ``KEY=VALUE`` of options that a run must have to be taken, with their full names.
-        expected: names of the folders that the folder's last command asked for; None where not known.
+        directory: the folder of a sweep, or any folder that contains runs.
+        only: texts ``KEY=VALUE`` with the full names of options; only runs with these values are read.
+        expected: names of the run folders that the last command of the folder should have made; None if they
+            are not known.
 
     Raises:
-        InputError: no such folder, no run in it, or runs on different data, which no table can hold.
+        InputError: there is no such folder, it contains no run, or the runs have different data, so that one
+            table cannot compare them.
     """
     directory = Path(directory)
-    everything = find_runs(directory)
-    found = choose(everything, only)
+    all_runs = find_runs(directory)
+    found = select_runs(all_runs, only)
     runs = [run for run in found if not run.is_evaluation]
     if not runs:
-        only_scores = ", only evaluations of other runs" if found else ""
+        hint = ", only evaluations of other runs" if found else ""
         raise InputError(
-            f"{directory}: no run in it{only_scores}; train some, for instance rcnn-odom train -m seed=0,1,2"
+            f"{directory}: no run in it{hint}; train some, for instance rcnn-odom train -m seed=0,1,2"
         )
-    folders = {run.name for run in everything}
+    folders = {run.name for run in all_runs}
     missing = [name for name in expected or () if name not in folders]
     options = swept_options([run for run in runs if run.settings])
     finished = [run for run in runs if run.status == "finished"]
@@ -135,41 +138,41 @@ def read_sweep(
 def load_runs(
     directory: str | Path, only: Sequence[str] = (), expected: Sequence[str] | None = None
 ) -> "pd.DataFrame":
-    """The runs below a folder as a table, one row a run, finished or not.
+    """Reads the runs below a folder as a table with one row for each run, finished or not.
 
-    Columns, empty (None or nan) where that is not known:
+    The table has these columns; a value that is not known is None or nan:
 
-    - ``run``: its path below the folder; ``status``: ``finished``, ``unfinished``, ``failed``, ``damaged``,
-      or ``missing`` (the folder's last command asked for it, and it is not there); ``problem``: why it is
-      not finished.
+    - ``run``: path of the run below the folder; ``status``: ``finished``, ``unfinished``, ``failed``,
+      ``damaged`` or ``missing`` (the last command of the folder should have made the run, but it does not
+      exist); ``problem``: why the run is not finished.
     - ``variant``, ``seed``, ``data``.
-    - a column for each swept option under its full name (``model.kernel_size``); lists as tuples.
-      ``attrs["options"]`` of the table names them.
-    - ``drift``: mean over the test sequences, a ratio; ``drift_NAME`` of each; ``floor`` of two-number
-      motion; ``val_drift`` of validation.
-    - every other metric over all test sequences, under its name (see
+    - a column for each swept option with its full name (``model.kernel_size``), lists as tuples.
+      ``attrs["options"]`` of the table contains these names.
+    - ``drift``: mean over the test sequences, a ratio; ``drift_NAME`` for each sequence; ``floor``: drift of
+      the true steps reduced to two numbers; ``val_drift``: drift on the validation sequences.
+    - every other metric over all test sequences under its name (see
       :func:`rcnn_odom.evaluation.metrics.all_metrics`): ``rotation_deg_per_m``, ``distance_mae_m`` ...
-    - ``latency_ms``: median time of a frame; ``seconds``: of training; ``first_stage_seconds``: of
-      training a recurrent network's first stage, where that was done within the run.
-    - ``same_as``: the run that did the same training before, and gave its weights.
-    - ``repeats``: the run in this table that has the same setting and seed, and counts in its place.
+    - ``latency_ms``: median time per frame; ``seconds``: training time; ``first_stage_seconds``: training
+      time of the first stage of a recurrent network, if the run trained it itself.
+    - ``same_as``: the run that did the same training before and whose weights were taken.
+    - ``repeats``: the run of this table that has the same setting and seed and counts instead.
 
-    Evaluations by ``evaluate.py`` are no runs and not in the table.
+    Evaluations by ``evaluate.py`` are not runs and not in the table.
 
     Args:
-        directory: a sweep's folder, or any around runs, for instance ``outputs``.
-        only: ``KEY=VALUE`` of options that a run must have to be in the table.
-        expected: names of the folders that should be there, for the status ``missing``; for a sweep's folder
-            :func:`rcnn_odom.training.sweep.expected_folders` knows them.
+        directory: the folder of a sweep, or any folder that contains runs, for instance ``outputs``.
+        only: texts ``KEY=VALUE``; only runs with these values are in the table.
+        expected: names of the run folders that should exist, for the status ``missing``; see
+            :func:`rcnn_odom.training.sweep.expected_folders` for the folder of a sweep.
 
     Raises:
-        InputError: no such folder, no run in it, or runs on different data.
+        InputError: there is no such folder, it contains no run, or the runs have different data.
     """
     return runs_table(read_sweep(directory, only, expected))
 
 
 def runs_table(sweep: Sweep) -> "pd.DataFrame":
-    """The table of :func:`load_runs` for runs that have been read."""
+    """Makes the table of :func:`load_runs` from runs that are already read."""
     import pandas as pd
 
     rows = [_row(sweep, run) for run in sweep.runs]

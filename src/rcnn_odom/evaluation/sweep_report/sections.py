@@ -1,4 +1,4 @@
-"""The report's sections in words and tables: what was swept, every score, the paper's beside it, the runs."""
+"""The text sections of the report: swept options, scores, results of the paper, runs, and commands."""
 
 import shlex
 from collections.abc import Iterable, Sequence
@@ -17,7 +17,7 @@ from rcnn_odom.evaluation.sweep_report.document import (
     markdown_table,
     number,
 )
-from rcnn_odom.evaluation.sweep_report.folders import Run, Scores, hydras
+from rcnn_odom.evaluation.sweep_report.folders import Run, Scores, read_hydra_value
 from rcnn_odom.evaluation.sweep_report.options import setting_of, show_value
 from rcnn_odom.evaluation.sweep_report.runs_table import MISSING, Sweep
 from rcnn_odom.evaluation.sweep_report.statistics import mean_sd
@@ -26,8 +26,8 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def opening(sweep: Sweep, now: datetime) -> str:
-    """Title, what was swept, how the runs ended, and a warning with every run that is not finished."""
+def opening_section(sweep: Sweep, now: datetime) -> str:
+    """Title, number of runs by status, a warning that lists all runs that are not finished, swept options."""
     counts = {"finished": len(sweep.finished)}
     for status in ("failed", "unfinished", "damaged"):
         counts[status] = sum(run.status == status for run in sweep.runs)
@@ -38,32 +38,34 @@ def opening(sweep: Sweep, now: datetime) -> str:
     lines = [
         f"# Runs in {code(sweep.directory.resolve().name)}",
         f"Written on {now:%Y-%m-%d at %H:%M}. Of {len(sweep.runs) + len(sweep.missing)} runs: {ended}.",
-        _problems(sweep),
-        _swept(sweep),
+        _warning(sweep),
+        _swept_options(sweep),
     ]
     return "\n\n".join(filter(None, lines))
 
 
-def _problems(sweep: Sweep) -> str:
+def _warning(sweep: Sweep) -> str:
+    """A warning that lists all runs that are not finished; empty if there are none."""
     problems = []
     for run in sweep.runs:
         if run.status != "finished":
-            # A sweep's folders are named by what their runs set.
+            # The names of a sweep's folders already contain the options that the runs set.
             options = [text for text in run.overrides if text.replace("=", "-") not in run.name]
-            which = f" ({escape(', '.join(options))})" if options else ""
-            problems.append(f"> - **{run.status}** {code(run.name)}{which}: {escape(run.problem)}")
+            options_note = f" ({escape(', '.join(options))})" if options else ""
+            problems.append(f"> - **{run.status}** {code(run.name)}{options_note}: {escape(run.problem)}")
     problems += [f"> - **missing** {code(name)}: {MISSING}" for name in sweep.missing]
     if not problems:
         return ""
     advice = (
-        "> No mean below contains them. Repeat the sweep's command to run what is not finished, "
-        "then make this report again."
+        "> They are left out of all means below. Repeat the command of the sweep to finish them, "
+        "then write this report again."
     )
     count = f"{len(problems)} run{'s are' if len(problems) > 1 else ' is'}"
     return "\n".join([f"> **Warning: {count} not finished.**", ">", *problems, ">", advice])
 
 
-def _swept(sweep: Sweep) -> str:
+def _swept_options(sweep: Sweep) -> str:
+    """The swept options with their values, the seeds, and the test sequences."""
     rows = []
     for place, option in enumerate(sweep.options):
         values = dict.fromkeys(show_value(setting[place]) for setting in sweep.by_setting)
@@ -73,11 +75,11 @@ def _swept(sweep: Sweep) -> str:
     first = next((run for run in sweep.runs if run.settings), None)
     name = first.settings.get("data.name") if first else None
     data = f"Tested on {', '.join(map(escape, sweep.sequences))} of {code(f'data={name}')}."
-    return "\n".join(["Swept:", "", *rows, "", data])
+    return "\n".join(["Swept options:", "", *rows, "", data])
 
 
 def drift_table(sweep: Sweep) -> tuple[Row, list[Row]]:
-    """Header and rows of the comparison table: settings, reference methods, baselines, the floor."""
+    """Header and rows of the drift table: settings, evaluated methods, baselines, and the floor."""
     header = ["drift in %", "seeds", "validation", *sweep.sequences, "mean", "ms a frame"]
     most = max(map(len, sweep.by_setting.values()))
     rows = []
@@ -96,7 +98,7 @@ def _scores(runs: Iterable[Run]) -> list[Scores]:
 
 
 def reference_methods(sweep: Sweep) -> dict[str, list[Scores]]:
-    """Scores of evaluations by name and folder, then of the baselines as each run has them."""
+    """Scores of the evaluations by method and folder, and those of the baselines from all finished runs."""
     methods: dict[str, list[Scores]] = {}
     for run in sweep.evaluations:
         methods[f"{run.metrics.variant} ({run.name})"] = [run.metrics.scores]
@@ -107,42 +109,50 @@ def reference_methods(sweep: Sweep) -> dict[str, list[Scores]]:
 
 
 def _drift_row(sweep: Sweep, label: str, seeds: str, scores: Sequence[Scores]) -> Row:
-    validation = _metric_cell(DRIFT, [one.get("val_drift") for one in scores])
-    return [label, seeds, validation, *_drift_cells(sweep, "drift", scores), number(_latency(scores))]
+    validation = _metric_cell(DRIFT, [each.get("val_drift") for each in scores])
+    return [label, seeds, validation, *_drift_cells(sweep, "drift", scores), number(_fastest_latency(scores))]
 
 
 def _drift_cells(sweep: Sweep, kind: str, scores: Sequence[Scores]) -> list[str]:
-    """``drift`` or ``floor`` of each test sequence and their mean, in percent."""
+    """Cells with the drift or the floor (``kind``) of each test sequence and the mean, in percent."""
     keys = [*(f"{kind}_{name}" for name in sweep.sequences), kind]
-    return [_metric_cell(DRIFT, [one.get(key) for one in scores]) for key in keys]
+    return [_metric_cell(DRIFT, [each.get(key) for each in scores]) for key in keys]
 
 
-def _latency(scores: Sequence[Scores]) -> float | None:
-    """Of the fastest seed, in milliseconds: other jobs on a machine only ever slow it."""
-    return min((one["latency_ms"] for one in scores if one.get("latency_ms") is not None), default=None)
+def _fastest_latency(scores: Sequence[Scores]) -> float | None:
+    """Latency of the fastest seed in milliseconds, because other jobs on the machine can only slow a run."""
+    return min((each["latency_ms"] for each in scores if each.get("latency_ms") is not None), default=None)
 
 
 def drift_section(sweep: Sweep, figure: str) -> str:
-    """The comparison table and how to read it."""
+    """The drift table with its explanation and its figure."""
     header, rows = drift_table(sweep)
     lines = [
         "## Drift",
         markdown_table(header, rows),
-        "Mean ± standard deviation over seeds (sample, divisor n-1); without one where there is one seed, or "
-        "all are the same. The mean column gives every test sequence the same weight. The time of a frame is "
-        "the fastest seed's median, as other jobs on the machine only ever slow it.",
+        "Mean ± sample standard deviation (divisor n-1) over seeds; the deviation is left out if there is "
+        "only one seed or all values are equal. The mean column gives each test sequence the same weight. "
+        "The time per frame is the median of the fastest seed, because other jobs on the machine can only "
+        "slow a run.",
     ]
     if any("(fewer)" in row[1] for row in rows):
-        lines.append("**(fewer)**: fewer seeds than the others have; its mean is not over the same seeds.")
+        lines.append(
+            "**(fewer)**: this setting has fewer seeds than others, so its mean is over other seeds."
+        )
     if sweep.evaluations:
         lines.append("Methods with a folder in brackets were scored by `evaluate.py`.")
     if sweep.left_out:
-        lines.append(f"Left out, as scored on other drives: {', '.join(map(code, sweep.left_out))}.")
+        lines.append(
+            f"Left out because they were scored on other drives: {', '.join(map(code, sweep.left_out))}."
+        )
     return "\n\n".join([*lines, figure])
 
 
 def paper_section(sweep: Sweep) -> str:
-    """The paper's table II beside ours, and what it claims of the swept options; empty for other drives."""
+    """The paper's claims about the swept options, and its table II beside our results on the same sequences.
+
+    Empty if there are neither.
+    """
     parts = [paper.CLAIMS[option] for option in sweep.options if option in paper.CLAIMS]
     if sweep.sequences == paper.SEQUENCES:
         names = [*paper.SEQUENCES, "mean"]
@@ -150,31 +160,34 @@ def paper_section(sweep: Sweep) -> str:
         header += [f"paper, {name}" for name in names] + ["paper, s a frame"]
         data = escape(sweep.finished[0].metrics.data)
         ours = (
-            f"Ours are on `data={data}`" if data == "kitti" else f"Ours are on {data} drives, not on KITTI's"
+            f"Our results are on `data={data}`"
+            if data == "kitti"
+            else f"Our results are on {data} drives, not on KITTI's"
         )
         parts += [
             markdown_table(header, _paper_rows(sweep)),
             paper.TABLE_NOTE,
-            f"{ours}: for orientation only.",
+            f"{ours}; the comparison is for orientation only.",
         ]
     return "\n\n".join(["## The paper", *parts]) if parts else ""
 
 
 def _paper_rows(sweep: Sweep) -> list[Row]:
+    """Rows of the settings that the paper has too, then of its other networks and compared methods."""
     rows: list[Row] = []
-    left = dict(paper.VARIANTS)
+    remaining = dict(paper.VARIANTS)
     for setting, runs in sweep.by_setting.items():
         variants = {run.metrics.variant for run in runs.values()}
         column = paper.VARIANTS.get(variants.pop()) if len(variants) == 1 else None
         if column is None or not all(paper.NETWORK.items() <= run.settings.items() for run in runs.values()):
             continue
-        left = {name: other for name, other in left.items() if other is not column}
+        remaining = {name: other for name, other in remaining.items() if other is not column}
         scores = _scores(runs.values())
-        latency = _latency(scores)
+        latency = _fastest_latency(scores)
         seconds = number(None if latency is None else latency / 1000, 4)
         cells = _drift_cells(sweep, "drift", scores)
         rows.append([sweep.label(setting), *cells, seconds, *_paper_cells(column)])
-    for column in (*left.values(), *paper.COMPARED_METHODS):
+    for column in (*remaining.values(), *paper.COMPARED_METHODS):
         rows.append([column.name, *[DASH] * 4, *_paper_cells(column)])
     return rows
 
@@ -184,19 +197,19 @@ def _paper_cells(column: paper.PaperColumn) -> list[str]:
 
 
 def metrics_table(sweep: Sweep) -> tuple[Row, list[Row]]:
-    """Header and rows of every metric but the drift, by setting and method, over all test sequences."""
+    """Header and rows of all metrics except the drift over all test sequences, by setting and method."""
     metrics = [metric for metric in all_metrics().values() if metric.name != "drift"]
     header = ["over all sequences", *(f"{metric.title} ({metric.unit})" for metric in metrics)]
     methods = {sweep.label(setting): _scores(runs.values()) for setting, runs in sweep.by_setting.items()}
     rows: list[Row] = [
-        [label, *(_metric_cell(metric, [one.get(metric.name) for one in scores]) for metric in metrics)]
+        [label, *(_metric_cell(metric, [each.get(metric.name) for each in scores]) for metric in metrics)]
         for label, scores in (methods | reference_methods(sweep)).items()
     ]
     return header, rows
 
 
 def _metric_cell(metric: Metric, values: Sequence[float | None]) -> str:
-    """Mean and deviation over the runs; of the largest errors the largest."""
+    """Mean and standard deviation over the runs; for a largest error, the largest of all runs."""
     known = [value for value in values if value is not None]
     if metric.combine == "max" or not known:
         return metric.show(max(known, default=None))
@@ -206,19 +219,19 @@ def _metric_cell(metric: Metric, values: Sequence[float | None]) -> str:
 
 
 def metrics_section(sweep: Sweep) -> str:
-    """The table of all metrics but the drift, and how to read it."""
+    """The table of all metrics except the drift, with its explanation."""
     lines = [
         "## Other metrics",
         markdown_table(*metrics_table(sweep)),
-        "Mean ± standard deviation over seeds. Mean absolute and signed errors are over all motions of the "
-        "test sequences; the largest error is that of any seed.",
+        "Mean ± standard deviation over seeds. Mean absolute and signed errors are means over all motions of "
+        "the test sequences; the largest error is the largest of all seeds.",
     ]
-    is_papers = sweep.sequences == paper.SEQUENCES
-    return "\n\n".join([*lines, paper.FRAME_ERRORS_NOTE] if is_papers else lines)
+    has_paper_sequences = sweep.sequences == paper.SEQUENCES
+    return "\n\n".join([*lines, paper.FRAME_ERRORS_NOTE] if has_paper_sequences else lines)
 
 
 def runs_section(sweep: Sweep, table: "pd.DataFrame") -> str:
-    """Every run with its setting, scores, time and place; the time of all together."""
+    """The table of all runs with setting, scores and training time, and the total training time."""
     shown = table.astype(object).where(table.notna(), None)
     labels = {run.name: sweep.label(setting_of(run, sweep.options)) for run in sweep.runs if run.settings}
     header = [
@@ -239,28 +252,30 @@ def runs_section(sweep: Sweep, table: "pd.DataFrame") -> str:
     known = own["seconds"].notna().sum()
     total = own["seconds"].sum() + own["first_stage_seconds"].sum()
     lines.append(
-        f"Trained for {duration(total)} in all, by the {known} runs whose time is known. A run that "
-        "took the weights of the same training elsewhere is not counted; first stages are where a run "
+        f"Total training time: {duration(total)}, of the {known} runs whose time is known. Runs that took "
+        "the weights of the same training elsewhere are not counted. First stages are counted if the run "
         "trained its own."
     )
     repeats = table[table["repeats"].notna()]
     if len(repeats):
         pairs = (f"{code(row['run'])} ({code(row['repeats'])} counts)" for _, row in repeats.iterrows())
-        lines.append(f"Not counted, as another run has the same setting and seed: {', '.join(pairs)}.")
+        lines.append(
+            f"Left out of the means because another run has the same setting and seed: {', '.join(pairs)}."
+        )
     return "\n\n".join(lines)
 
 
 def origin_section(sweep: Sweep) -> str:
-    """The commands that made the runs, and what computed them."""
+    """The commands of the runs, and the versions of the packages that were used."""
     every = [run.metrics.versions for run in sweep.finished]
-    packages = dict.fromkeys(package for one in every for package in one)
-    versions = {name: dict.fromkeys(one[name] for one in every if name in one) for name in packages}
+    packages = dict.fromkeys(package for each in every for package in each)
+    versions = {name: dict.fromkeys(each[name] for each in every if name in each) for name in packages}
     found = ", ".join(f"{escape(name)} {escape(' and '.join(numbers))}" for name, numbers in versions.items())
     differing = [name for name, numbers in versions.items() if len(numbers) > 1]
     warning = f"> **Warning: the runs were made with different versions of {escape(', '.join(differing))}.**"
     return "\n\n".join(
         [
-            "## Where it comes from",
+            "## Commands and versions",
             *_commands(sweep),
             *([warning] if differing else []),
             f"Versions: {found}." if found else "The versions are not known.",
@@ -269,14 +284,14 @@ def origin_section(sweep: Sweep) -> str:
 
 
 def _commands(sweep: Sweep) -> list[str]:
-    """The folder's last command, as Hydra keeps it, and the one that repeats each finished run."""
+    """The last command of the folder, from Hydra's files, and the commands that repeat each finished run."""
     every = [run.overrides for run in sweep.finished if run.overrides]
-    titles = {"Each run alone": every}
-    if given := hydras(sweep.directory / "multirun.yaml", "hydra", "overrides"):
+    titles = {"Commands of the single runs": every}
+    if given := read_hydra_value(sweep.directory / "multirun.yaml", "hydra", "overrides"):
         words = [
             word for group in ("hydra", "task") for word in given[group] if word != "hydra.mode=MULTIRUN"
         ]
-        titles = {"The last command for this folder": [("-m", *map(str, words))], **titles}
+        titles = {"Last command of this folder": [("-m", *map(str, words))], **titles}
     lines = []
     for title, commands in titles.items():
         shown = dict.fromkeys("    " + shlex.join(["rcnn-odom", "train", *options]) for options in commands)
