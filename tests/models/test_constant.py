@@ -39,5 +39,5 @@ def test_mean_step_is_left_out_where_a_drive_cannot_be_read(caplog):
     with caplog.at_level(logging.INFO):
         assert mean_step(open_recording, ["a", "c"]) is None
     assert caplog.messages == [
-        "mean_motion is left out, since not all of data.train can be read: c: no such recording"
+        "mean_motion is left out, because not all of data.train can be read: c: no such recording"
     ]

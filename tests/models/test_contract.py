@@ -82,7 +82,7 @@ class OfWholeScans(Model):
     [
         (WithoutLoss, "model toy: lacks loss; "),
         (type("Bare", (Model,), {}), "model toy: lacks name, Options, estimate, stepper or tracker; "),
-        (Lonely, "model toy: is no subclass of Model; "),
+        (Lonely, "model toy: is not a subclass of Model; "),
         (find_model("cnn_reg"), "model toy: its class is named cnn_reg; "),
     ],
 )
@@ -96,7 +96,7 @@ def test_a_model_of_whole_scans_needs_no_stepper():
     check_model("toy", OfWholeScans)
     toy = OfWholeScans({}, SENSOR)
     assert toy.tracker() == "a tracker"
-    with pytest.raises(NotImplementedError, match="toy looks at whole scans"):
+    with pytest.raises(NotImplementedError, match="toy uses whole scans"):
         toy.stepper()
 
 
@@ -140,7 +140,7 @@ def test_options_of_every_choice_are_accepted(choice):
         ({"freeze": 1}, "model.freeze=1: must be true or false"),
         ({"projection": 0}, "model.projection=0: must be null or a whole number above 0"),
         ({"rotation_classes": {"count": 0, "width_deg": 1.0}}, "model.rotation_classes.count=0: must be"),
-        ({"first_stage": 3}, "model.first_stage=3: has parts to set"),
+        ({"first_stage": 3}, "model.first_stage=3: is a group; set its members"),
         ({"first_stage": {**options("cnn_cls"), "variant": "cnn_reg"}}, "model.first_stage.variant=cnn_reg"),
         ({"hidden": 3}, "model.hidden: there is no such option"),
     ],

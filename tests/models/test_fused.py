@@ -18,7 +18,7 @@ from rcnn_odom.geometry import Step, relative_step, relative_steps
 from rcnn_odom.models.contract import Description
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.fused import (
-    COMPARED,
+    AVERAGED_MATCHES,
     INFLATION,
     LEAST_DISTANCE,
     Fused,
@@ -97,7 +97,7 @@ def test_a_perfect_prior_follows_the_truth_along_a_bare_corridor():
     assert np.abs((steps - truth).sum(0)[[1, 2]]).max() < 0.05
     held = [each for each in fused if any(note.startswith("held") for note in each.notes)]
     assert len(held) > 100
-    assert all(any("the network tells it" in note for note in each.notes) for each in held)
+    assert all(any("the network's step is used" in note for note in each.notes) for each in held)
 
 
 def test_a_prior_of_unknown_covariance_is_only_the_start():
@@ -163,7 +163,7 @@ def test_a_network_that_is_wrong_where_the_scans_tell_is_believed_less():
     after, _ = source.expect(scans[1], 1, 0.1, held)
     assert before.pull[0, 0] == pytest.approx(INFLATION**2 * 1e-6 + LEAST_DISTANCE**2)
     # One without memory would be at the mean square of the errors.
-    seen = 1 - (1 - 1 / COMPARED) ** 59
+    seen = 1 - (1 - 1 / AVERAGED_MATCHES) ** 59
     expected = before.pull[0, 0] * (1 - seen) + seen * np.square(half - truth)[:, 0].mean()
     assert after.pull[0, 0] == pytest.approx(expected, rel=0.3)
     assert after.pull[2, 2] == before.pull[2, 2], "of the heading it was right"
@@ -191,7 +191,7 @@ def test_where_nothing_matches_the_networks_step_stands():
     assert lost
     for each in lost:
         assert each.kind is Kind.ESTIMATED
-        assert any("the network tells it" in note for note in each.notes)
+        assert any("the network's step is used" in note for note in each.notes)
         np.testing.assert_allclose(each.step.array(), told[0], atol=0.05)
 
 
@@ -244,10 +244,10 @@ def test_a_missing_file_is_told_in_one_line(tmp_path):
     with pytest.raises(InputError, match=r"none\.onnx: no such file, nor a model that ships") as told:
         Fused({"network": "none.onnx"}, ROUND)
     assert "\n" not in str(told.value)
-    with pytest.raises(InputError, match="no ONNX file that can be run") as told:
+    with pytest.raises(InputError, match="not an ONNX file that can be run") as told:
         Fused({"network": str(bad)}, ROUND).tracker()
     assert "\n" not in str(told.value)
-    with pytest.raises(InputError, match=r"model\.network= : must be a network that ships along"):
+    with pytest.raises(InputError, match=r"model\.network= : must be the name of a shipped network"):
         check_options(Fused.Options, {"network": " "}, "model.")
 
 
@@ -274,7 +274,7 @@ def test_it_runs_on_recordings_and_streams(tmp_path, capsys, monkeypatch):
     for words in (["--network", "held"], ["--model", "fused", "--wheels"]):
         with pytest.raises(SystemExit):
             main(["run", source, *words, "--out", str(tmp_path / "y")])
-    assert "--wheels is of the matcher alone" in capsys.readouterr().err
+    assert "--wheels works only with the matcher" in capsys.readouterr().err
 
 
 def test_the_default_is_the_matcher_alone():

@@ -157,7 +157,7 @@ def test_first_stage_is_taken_over_with_its_units(variant):
 )
 def test_another_first_stage_is_refused(key, value):
     cnn = build("cnn_cls", **{key: value})
-    with pytest.raises(InputError, match=f"trained with {key}=.*, but model.{key} is .*; set it as in that"):
+    with pytest.raises(InputError, match=f"trained with {key}=.*, but model.{key} is .*; set model.{key} as"):
         build().take_first_stage(cnn)
 
 

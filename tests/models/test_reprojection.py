@@ -7,7 +7,7 @@ import pytest
 
 from rcnn_odom.geometry import advance, planar_to_poses, poses_to_planar
 from rcnn_odom.models.encoding import Sensor, decode, encode
-from rcnn_odom.models.reprojection import HIDDEN, render, reproject
+from rcnn_odom.models.reprojection import OCCLUSION_DEPTH, render, reproject
 from rcnn_odom.recordings import simulated
 from rcnn_odom.simulation import worlds
 from rcnn_odom.simulation.laser import Laser
@@ -168,7 +168,7 @@ def test_points_less_than_half_a_metre_apart_are_averaged():
     scan[9], scan[10] = 5.0, 5.3
     ahead = reproject(scan, sensor, [-20.0, 0.0, 0.0])
     both = [np.hypot(*point) for point in decode(scan, sensor) + np.array([20, 0])]
-    assert abs(both[0] - both[1]) < HIDDEN
+    assert abs(both[0] - both[1]) < OCCLUSION_DEPTH
     assert ahead[9] == pytest.approx(np.mean(both))
     scan[10] = 8.0
     assert reproject(scan, sensor, [-20.0, 0.0, 0.0])[9] == pytest.approx(25.0)

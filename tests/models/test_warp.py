@@ -19,7 +19,14 @@ from rcnn_odom.geometry import (
     poses_to_planar,
     relative_step,
 )
-from rcnn_odom.models.cnn_warp import FINE, CNNWarp, LocalConstraints, compare, invert, log_determinant
+from rcnn_odom.models.cnn_warp import (
+    LINEAR_BELOW,
+    CNNWarp,
+    LocalConstraints,
+    compare,
+    invert,
+    log_determinant,
+)
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import PairTracker, as_used
 from rcnn_odom.models.rcnn_warp import RCNNWarp
@@ -312,7 +319,9 @@ def test_the_channels_of_an_image():
     image = compare(torch.stack([before, now])[None], sensor)
     assert image.shape == (1, 5, 1, 5)
     difference, depth, slope, sees, both = image[0, :, 0]
-    assert torch.allclose(difference, torch.tensor([0, 0, math.asinh(0.05 / FINE) / 2, 0, 0]), atol=1e-6)
+    assert torch.allclose(
+        difference, torch.tensor([0, 0, math.asinh(0.05 / LINEAR_BELOW) / 2, 0, 0]), atol=1e-6
+    )
     assert torch.allclose(depth[:3], torch.log(now[:3] / 10))
     assert sees.tolist() == [1, 1, 1, 0, 1]
     assert both.tolist() == [1, 0, 1, 0, 1]

@@ -1,1 +1,1 @@
-"""Estimators: scans in, steps out. Importing the package loads nothing heavy."""
+"""Estimators, which convert scans into steps. Importing this package loads no large libraries."""

@@ -1,7 +1,7 @@
-"""The convolutional networks of the paper, and what all its networks share.
+"""The convolutional networks of the paper, and the parts that all its networks share.
 
-Encoder (paper table I), heads (paper III-C1), losses (eq. 3 and 4), and the step that is meant by the two
-numbers that a head says, distance and heading change.
+These are the encoder (paper table I), the heads (paper III-C1), the losses (eq. 3 and 4), and the conversion
+of a head's two outputs, distance and heading change, into a step.
 """
 
 import math
@@ -26,13 +26,18 @@ from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
 CHANNELS = (32, 32, 64, 64, 128, 128)
+"""Output channels of the six convolutions."""
 STRIDES = (1, 2, 1, 2, 1, 2)
+"""Strides of the six convolutions."""
 
 
 class Estimate(NamedTuple):
-    """What a head says: motions (..., 2) in metres and radians; class scores (..., C) or None.
+    """The output of a head.
 
-    Of a recurrent network also the motions (..., 2) that its first stage estimates.
+    Attributes:
+        motion: (..., 2) distance in metres and heading change in radians.
+        scores: (..., C) class scores; None for regression.
+        first_stage: (..., 2) motions that the first stage of a recurrent network estimates; None without one.
     """
 
     motion: Tensor
@@ -42,7 +47,17 @@ class Estimate(NamedTuple):
 
 @dataclass(frozen=True)
 class RotationClasses:
-    """Equal heading classes around straight ahead (paper III-C: 112 of 0.1 degrees)."""
+    """Heading classes of equal width around straight ahead (paper III-C: 112 classes of 0.1 degrees).
+
+    Attributes:
+        count: number of classes.
+        width_deg: width of a class in degrees.
+
+    Example:
+        >>> classes = RotationClasses(count=2, width_deg=1.0)
+        >>> classes.index(torch.deg2rad(torch.tensor([-0.5, 0.5, 9.0]))).tolist()
+        [0, 1, 1]
+    """
 
     count: int = option(above=0)
     width_deg: float = option(above=0)
@@ -53,21 +68,21 @@ class RotationClasses:
         return math.radians(self.width_deg)
 
     def centres(self) -> Tensor:
-        """(count,) headings in radians."""
+        """Headings (count,) of the centres of the classes in radians."""
         return (torch.arange(self.count, dtype=torch.float64) - (self.count - 1) / 2) * self.width
 
     def index(self, heading: Tensor) -> Tensor:
-        """Class of headings in radians; those outside the range go to the outermost class."""
+        """Classes of headings in radians; headings outside the range belong to the outermost class."""
         return torch.floor(heading / self.width + self.count / 2).clamp(0, self.count - 1).long()
 
     def outside(self, heading: Tensor) -> Tensor:
-        """How many headings lie outside the range: a scalar."""
+        """Number of headings outside the range, a scalar."""
         return (heading.abs() > self.count / 2 * self.width).sum()
 
 
 @dataclass(kw_only=True)
 class CNNOptions(Recipe):
-    """What ``conf/model`` sets; the comments there say what each means."""
+    """The options of ``conf/model/cnn_reg.yaml`` and ``cnn_cls.yaml``, whose comments explain them."""
 
     kernel_size: int = option(fits=lambda size: size > 0 and size % 2 == 1, wanted="odd; the paper uses 3")
     pooling: str = option(choices=("avg", "max"))
@@ -80,25 +95,27 @@ class CNNOptions(Recipe):
 
 
 class Encoder(nn.Module):
-    """Six convolutions over a pair of depth vectors (paper table I) with two poolings between them.
+    """Six convolutions over a pair of depth vectors (paper table I), with two pooling layers between them.
 
-    ``Conv2d`` with a height of one instead of ``Conv1d``: only the former has fast channels-last
-    kernels on the CPU. Padding keeps the length of stride-1 layers: 3,601 bins give 128 x 113 features.
+    ``Conv2d`` with a height of one is used instead of ``Conv1d``, because only ``Conv2d`` has fast
+    channels-last kernels on the CPU. Padding keeps the length in layers of stride 1: 3,601 bins give
+    128 x 113 features.
 
     Args:
-        sensor: whose depth vectors it is given; ranges are divided by its ``max_range``.
-        kernel_size: odd; the paper chose 3 and tried 5 and 7.
+        sensor: defines the depth vectors; ranges are divided by its ``max_range``.
+        kernel_size: an odd number; the paper chose 3 and also tried 5 and 7.
         pooling: ``avg`` (the paper's choice) or ``max``.
-        inputs: channels of an image; 2: the two scans.
+        inputs: number of input channels; 2 for the two scans.
 
     Attributes:
-        channels: of the output.
-        places: bins, with fractions, in whose middle each place of the output looks, (places,).
-        features: channels times places.
+        channels: number of output channels.
+        places: (places,) centre of each output position, in bins, with fractions.
+        features: number of output values, channels times places.
+        max_range: that of the sensor, in metres.
 
     Raises:
-        InputError: there are too few bins for six layers.
-        ValueError: the kernel has no middle.
+        InputError: the sensor has too few bins for six layers.
+        ValueError: ``kernel_size`` is even.
     """
 
     def __init__(
@@ -110,10 +127,10 @@ class Encoder(nn.Module):
     ) -> None:
         super().__init__()
         if kernel_size % 2 == 0:
-            raise ValueError(f"kernel_size must be odd, not {kernel_size}: padding could not keep the length")
+            raise ValueError(f"kernel_size must be odd, not {kernel_size}, so that padding keeps the length")
         layers: list[nn.Module] = []
         length = sensor.bins
-        first, spacing = 0.0, 1  # of the places, in bins
+        first, spacing = 0.0, 1  # centre of the first output position, and spacing of the positions, in bins
         for number, (channels, stride) in enumerate(zip(CHANNELS, STRIDES, strict=True)):
             if number in (2, 4):
                 pool = {"avg": nn.AvgPool2d, "max": nn.MaxPool2d}[pooling]
@@ -129,7 +146,7 @@ class Encoder(nn.Module):
             length, inputs, spacing = (length - 1) // stride + 1, channels, spacing * stride
         if length < 1:
             raise InputError(
-                f"data.sensor has {sensor.bins} bins, too few for the network; six layers leave none"
+                f"data.sensor has {sensor.bins} bins, which are too few for the network's six layers"
             )
         self.layers = nn.Sequential(*layers)
         self.layers.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
@@ -144,33 +161,37 @@ class Encoder(nn.Module):
 
     def convolve(self, image: Tensor) -> Tensor:
         """Features (N, channels, 1, places) of images (N, inputs, 1, bins)."""
-        # The motion shows in small differences between two scans: bf16 would round them away before the
-        # first layer can take them.
+        # The motion appears as small differences between two scans, which bf16 would round to zero before
+        # the first layer can compute them.
         with torch.autocast(image.device.type, enabled=False):
             image = self.layers[0](image)
         if torch.is_autocast_enabled(image.device.type):
-            # The next layer rounds anyway: before the ReLU instead of after it, the result is the same
-            # and half as many bytes pass through memory.
+            # The next layer rounds anyway. Rounding before the ReLU gives the same result and halves the
+            # memory traffic.
             image = image.to(torch.get_autocast_dtype(image.device.type))
         convolved: Tensor = self.layers[1:](image)
         return convolved
 
     def lay_out(self, pairs: Tensor) -> Tensor:
-        """Images (B, 2, 1, bins) whose two scans are innermost in memory: the channels-last layout."""
+        """Images (B, 2, 1, bins) of pairs (B, 2, bins), in channels-last memory layout."""
         return pairs.transpose(1, 2).contiguous().transpose(1, 2).unsqueeze(2)
 
 
 class MotionHead(nn.Module):
     """Two fully connected layers, one for the distance and one for the rotation (paper III-C1).
 
-    The linear layers give standardised values; mean and deviation of the training set's motions, kept
-    as buffers, turn them into metres and radians. It is the paper's layer with its weights measured
-    in units that suit the optimiser: radians a frame are otherwise a hundred times smaller than metres.
+    The layers give standardised values, which are converted into metres and radians with the mean and the
+    standard deviation of the training motions (stored as buffers). This is equivalent to the paper's layers,
+    but suits the optimiser better: radians per scan are about a hundred times smaller than metres per scan.
 
     Args:
         features: width of the input.
-        classes: rotation as classification; None for regression.
-        angle: class scores become an angle by ``expectation`` over the classes, or ``argmax``.
+        classes: classes of the rotation; None for regression.
+        angle: how class scores give an angle: ``expectation`` over the classes, or ``argmax``.
+
+    Attributes:
+        mean: (2,) mean of the training motions, in metres and radians.
+        deviation: (2,) their standard deviation.
     """
 
     centres: Tensor | None
@@ -190,8 +211,8 @@ class MotionHead(nn.Module):
         self.register_buffer("deviation", torch.ones(2))
 
     def forward(self, features: Tensor) -> Estimate:
-        """Estimates (..., 2) and scores (..., C) from features (..., features)."""
-        # bf16 has three digits: too few for a distance that is added up over thousands of frames.
+        """Motions (..., 2) and class scores (..., C) of features (..., features)."""
+        # bf16 has three digits, which are too few for distances that are summed over thousands of scans.
         with torch.autocast(features.device.type, enabled=False):
             features = features.float()
             distance = self.distance(features).squeeze(-1) * self.deviation[0] + self.mean[0]
@@ -205,17 +226,22 @@ class MotionHead(nn.Module):
         return Estimate(torch.stack([distance, heading], -1), scores)
 
     def standardise(self, motion: Tensor) -> Tensor:
-        """Motions (..., 2) in deviations from the training set's mean."""
+        """Motions (..., 2) minus the training set's mean, divided by its standard deviation."""
         return (motion - self.mean) / self.deviation
 
 
 class TwoNumberModel(TrainedModel):
-    """A network that says distance and heading change: their loss, and the step that they mean.
+    """Base class of networks that estimate distance and heading change: their loss and their steps.
 
-    A subclass builds ``head`` and has :meth:`motions`. ``apply`` is where along its turn a step is taken.
+    A subclass builds ``head`` and defines :meth:`motions`. The option ``apply`` is the part of the turn after
+    which the distance is driven (see :mod:`rcnn_odom.models.two_numbers`).
 
     Attributes:
-        classifies: the head's rotation is a classification.
+        classifies: whether the rotation is estimated by classification.
+        head: gives the motions.
+        classes: heading classes.
+        turn_fraction: part of the turn after which the distance is driven, from 0 to 1.
+        uncertainty: standard deviations of the motions.
     """
 
     only_in_training: ClassVar[tuple[str, ...]] = ("beta", "per_sample_norm", "dropout")
@@ -233,7 +259,7 @@ class TwoNumberModel(TrainedModel):
         """Motions (B, T, 2) of pairs of scans (B, T, 2, bins) in metres, and the state after them."""
 
     def forward(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Steps (B, T, 3), their covariances (B, T, 3, 3) and the state after them."""
+        """Steps (B, T, 3), their covariances (B, T, 3, 3) and the state after the last pair."""
         estimate, state = self.motions(pairs, state)
         distance, turn = estimate.motion.unbind(-1)
         direction = self.turn_fraction * turn
@@ -242,14 +268,16 @@ class TwoNumberModel(TrainedModel):
         return steps, self._covariances(distance, direction, deviations.square()), state
 
     def _covariances(self, distance: Tensor, direction: Tensor, variances: Tensor) -> Tensor:
-        """J V J' (..., 3, 3), V the variances of the distance, across the step and of the turn.
+        """The covariances J V J' (..., 3, 3) of steps.
 
-        J are the derivatives of x, y and heading by these three. Written out, since a product of matrices
-        would lose the heading's variance, which does not depend on it, where that across the step is nan.
+        V is the diagonal matrix of the variances of the distance, across the step, and of the turn. J
+        contains the derivatives of x, y and heading by these three. The products are computed element by
+        element, because a matrix product would make the heading's variance nan if that across the step is
+        nan, although it does not depend on it.
 
         Args:
             distance: (...) metres.
-            direction: (...) radians, of the step in the frame of the earlier scan.
+            direction: (...) direction of the step in the frame of the earlier scan, in radians.
             variances: (..., 2) of distance and turn.
         """
         along, turned = variances.unbind(-1)
@@ -259,12 +287,12 @@ class TwoNumberModel(TrainedModel):
         xx = cos.square() * along + sin.square() * across + x_by_turn.square() * turned
         yy = sin.square() * along + cos.square() * across + y_by_turn.square() * turned
         xy = cos * sin * (along - across) + x_by_turn * y_by_turn * turned
-        unknown = 0 * across  # nan where x and y are not known: then their covariances are not either
+        unknown = 0 * across  # nan if the variances of x and y are nan, so that their covariances are too
         xh, yh = x_by_turn * turned + unknown, y_by_turn * turned + unknown
         return torch.stack([xx, xy, xh, xy, yy, yh, xh, yh, turned], -1).unflatten(-1, (3, 3))
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """Eq. 3 or 4 of a batch of windows, its two parts, and how many headings no class covers."""
+        """The loss of eq. 3 or 4, its two parts, and the fraction of headings outside all classes."""
         x, y, heading = batch["steps"].unbind(-1)
         truth = torch.stack([x * (heading / 2).cos() + y * (heading / 2).sin(), heading], -1)
         estimate, _ = self.motions(batch["pairs"])
@@ -277,12 +305,12 @@ class TwoNumberModel(TrainedModel):
             loss = classification_loss(estimate.motion, estimate.scores, truth, classes, beta, per_sample)
             outside = {"headings_outside_classes": self.classes.outside(heading) / heading.numel()}
         parts = {"loss_distance": loss.distance, "loss_rotation": loss.rotation}
-        # One bad window spoils the mean of all: the estimates tell which it is.
+        # One bad window makes the mean of all nan; the estimates show which window it is.
         diverged = ~estimate.motion.isfinite().flatten(1).all(1)
         return {"loss": loss.total, **parts, **outside, "diverged": diverged}
 
     def set_units(self, steps: FloatArray) -> None:
-        """Gives the heads the mean and the deviation of the training motions, their units."""
+        """Also sets the mean and the standard deviation of the training motions in all heads."""
         super().set_units(steps)
         motions = motions_of(steps)
         for head in (part for part in self.modules() if isinstance(part, MotionHead)):
@@ -290,19 +318,21 @@ class TwoNumberModel(TrainedModel):
             head.deviation.copy_(torch.from_numpy(np.maximum(motions.std(0), 1e-6)))
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
-        """Fits the uncertainty as well."""
+        """Also fits the uncertainty."""
         super().calibrate(drives)
-        features, motions = (np.concatenate(each) for each in zip(*map(self._study, drives), strict=True))
+        features, motions = (
+            np.concatenate(each) for each in zip(*map(self._features_and_motions, drives), strict=True)
+        )
         truth = np.concatenate([drive.steps for drive in drives])
         self.uncertainty.fit(features, two_number_errors(motions, truth, self.options["apply"]))
 
     @property
     def calibrated(self) -> bool:
-        """Also asks for the deviation across a step, which checkpoints of version 0.1 do not have."""
+        """Also requires the deviation across a step, which checkpoints of version 0.1 do not have."""
         return super().calibrated and bool(torch.isfinite(self.uncertainty.lateral))
 
     @torch.no_grad()
-    def _study(self, drive: Drive) -> tuple[FloatArray, FloatArray]:
+    def _features_and_motions(self, drive: Drive) -> tuple[FloatArray, FloatArray]:
         """Difficulty features (N-1, K) and motions (N-1, 2) of a drive."""
         state: State = ()
         features, motions = [], []
@@ -313,11 +343,12 @@ class TwoNumberModel(TrainedModel):
         return np.concatenate(features), np.concatenate(motions)
 
     def _difficulty(self, estimate: Estimate) -> Tensor:
+        """Difficulty features (..., K) of an estimate."""
         return self.uncertainty.features(estimate.motion, self.head.deviation, estimate.first_stage)
 
 
 class ConvolutionalModel(TwoNumberModel):
-    """Encoder and head: a motion from one pair of scans, no memory (paper III-C1)."""
+    """Encoder and head, which estimate the motion from one pair of scans without a state (paper III-C1)."""
 
     Options = CNNOptions
 
@@ -328,17 +359,17 @@ class ConvolutionalModel(TwoNumberModel):
         self.head = MotionHead(self.encoder.features, classes, options["angle"])
 
     def motions(self, pairs: Tensor, state: State = ()) -> tuple[Estimate, State]:
-        """Motions (B, T, 2) of pairs (B, T, 2, bins); dropout hides a part of the features from the head."""
+        """Motions (B, T, 2) of pairs (B, T, 2, bins) in metres; dropout applies to the features."""
         return self.head(F.dropout(self.encoder(pairs), self.options["dropout"], self.training)), ()
 
 
 class CNNRegression(ConvolutionalModel):
-    """Both outputs by eq. 3."""
+    """Distance and rotation by regression, with the loss of eq. 3."""
 
     name, classifies = "cnn_reg", False
 
 
 class CNNClassification(ConvolutionalModel):
-    """Rotation by eq. 4: the first stage of both recurrent networks."""
+    """Rotation by classification, with the loss of eq. 4; the first stage of both recurrent networks."""
 
     name, classifies = "cnn_cls", True

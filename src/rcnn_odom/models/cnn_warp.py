@@ -1,13 +1,13 @@
-"""A network that measures what is left of a motion after a first guess (predict, warp, correct).
+"""A network that measures the residual motion: the difference between a guessed and the true motion.
 
-Both scans are drawn as surfaces, the earlier one as seen from where the guess leads
-(:mod:`rcnn_odom.models.reprojection`), and the paper's six convolutions compare them. At each of their last
-places the network says how far the surface there is off, in which direction it can tell, and how surely; the
-residual motion is the weighted least-squares solution of all places, and its covariance the inverse of their
-information. So every place is judged alike, whatever its bearing, and a direction in which nothing is seen
-keeps the guess and gets a large deviation.
+Both scans are rendered as surfaces, the earlier one from the guessed pose of the later one
+(:mod:`rcnn_odom.models.reprojection`), and the paper's six convolutions compare them. For each position of
+their output, which covers a sector of bearings, the network gives one linear constraint: a direction, the
+offset of the surface along it, and a weight. The residual motion is the weighted least-squares solution of
+all constraints, and its covariance is the inverse of their information matrix. The same weights apply at all
+bearings. In a direction that no surface constrains, the guess remains and the deviation is large.
 
-Training draws the guesses: any pair of scans whose motion is known gives pairs of any residual motion.
+In training, the guesses are random: a pair of scans with a known motion can have any residual motion.
 """
 
 import math
@@ -36,36 +36,40 @@ from rcnn_odom.models.pairs import estimate_pairs
 from rcnn_odom.models.reprojection import DepthVector, render_many
 from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
-from rcnn_odom.models.uncertainty import WITHIN
+from rcnn_odom.models.uncertainty import WITHIN_DEVIATION
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
 CHANNELS = 5
-"""Of an image of two scans: see :func:`compare`."""
-FINE = 0.05
-"""Metres from which on a difference of ranges counts by its logarithm."""
-NEAR = 10.0
-"""Metres: the middle of the ranges, of which the logarithm is taken."""
-LOG_WEIGHT, LEAST_LOG_PRIOR = (-12.0, 8.0), -4.0
-"""Bounds of the logarithm of a place's weight, and of that of the prior's: fp32 cannot solve for more."""
+"""Number of channels of the image of two scans, see :func:`compare`."""
+LINEAR_BELOW = 0.05
+"""Metres; below this, the image is linear in a difference of ranges, and above this logarithmic."""
+TYPICAL_RANGE = 10.0
+"""Metres; a typical range, at which the logarithm of the range is 0 in the image."""
+LOG_WEIGHT_BOUNDS, LEAST_LOG_PRIOR = (-12.0, 8.0), -4.0
+"""Bounds of the logarithm of a constraint's weight, and the lower bound of that of the prior's weights.
+
+Outside these bounds, fp32 is not accurate enough to solve the normal equations.
+"""
 ROUNDING = 1e-6
-"""Of fp32, relative to an entry of a matrix."""
-COVARIANCE_PART = 0.05
-"""Of the loss, of the likelihood by which the covariances are learned."""
-FROM_REST = 0.1
-"""Share of the guesses in training that are no motion at all, as at the beginning of a drive."""
-FARTHEST_FROM_REST, SHARPEST_FROM_REST = 3.0, 0.35
-"""Metres and radians of such residual motions at most."""
+"""Relative rounding error of a matrix entry in fp32."""
+LIKELIHOOD_WEIGHT = 0.05
+"""Weight of the likelihood in the loss; the covariances are learned from it."""
+REST_FRACTION = 0.1
+"""Fraction of the training guesses that assume no motion, as at the beginning of a drive."""
+LARGEST_REST_DISTANCE, LARGEST_REST_TURN = 3.0, 0.35
+"""Metres and radians; a training guess assumes no motion only if the true motion is smaller than these."""
 
 
 @dataclass(frozen=True)
 class ResidualOptions:
-    """How far off the guesses are in training.
+    """Distribution of the residual motions in training.
 
     Attributes:
-        x, y: metres, standard deviations along and across the motion.
-        heading_deg: degrees.
-        smallest, largest: powers of ten between which each of the three deviations is scaled by itself.
+        x, y: standard deviations in metres, ahead and to the left.
+        heading_deg: standard deviation in degrees.
+        smallest, largest: the three deviations are multiplied by a random power of ten, whose exponent lies
+            between these two numbers.
     """
 
     x: float = option(above=0)
@@ -77,7 +81,7 @@ class ResidualOptions:
 
 @dataclass(kw_only=True)
 class WarpOptions(Recipe):
-    """What ``conf/model`` sets; the comments there say what each means."""
+    """The options of ``conf/model/cnn_warp.yaml``, whose comments explain them."""
 
     kernel_size: int = option(fits=lambda size: size > 0 and size % 2 == 1, wanted="odd; the paper uses 3")
     pooling: str = option(choices=("avg", "max"))
@@ -92,44 +96,49 @@ class WarpOptions(Recipe):
 
 
 def compare(pairs: Tensor, sensor: Sensor) -> Tensor:
-    """Images (N, 5, 1, bins) of drawn pairs (N, 2, bins), the guess's scan first.
+    """The network's input images (N, 5, 1, bins) of pairs of rendered scans.
 
-    The channels: the difference of the ranges, linear up to some centimetres and logarithmic beyond; the
-    logarithm of the later scan's range; its slope (the tangent of the angle at which the surface is hit);
-    where the later scan sees something; where both do.
+    The channels are: the difference of the ranges, linear up to some centimetres and logarithmic beyond; the
+    logarithm of the later scan's range; the slope of the later scan's surface (the tangent of the angle of
+    incidence, compressed by asinh); 1 where the later scan has a return; 1 where both scans have one.
 
     Args:
-        pairs: metres, 0 where nothing is seen.
-        sensor: the bins.
+        pairs: (N, 2, bins) metres, 0 without a return; the earlier scan, seen from the guess, is the first.
+        sensor: defines the bins.
+
+    Example:
+        >>> pairs = torch.full((1, 2, 5), 10.0)
+        >>> compare(pairs, Sensor(resolution_deg=90.0))[0, :, 0, 0].tolist()
+        [0.0, 0.0, 0.0, 1.0, 1.0]
     """
     before, now = pairs.unbind(-2)
-    sees = now > 0
-    both = sees & (before > 0)
+    has_return = now > 0
+    both = has_return & (before > 0)
     zero = now.new_zeros(())
-    difference = torch.where(both, torch.asinh((now - before) / FINE), zero) / 2
-    depth = torch.where(sees, torch.log(now.clamp(min=0.1) / NEAR), zero)
+    difference = torch.where(both, torch.asinh((now - before) / LINEAR_BELOW), zero) / 2
+    depth = torch.where(has_return, torch.log(now.clamp(min=0.1) / TYPICAL_RANGE), zero)
     right, middle, left = now[..., :-2], now[..., 1:-1], now[..., 2:]
     across = 2 * math.radians(sensor.resolution_deg) * middle.clamp(min=0.1)
     is_surface = (left > 0) & (middle > 0) & (right > 0)
     slope = torch.where(is_surface, torch.asinh((left - right) / across), zero) / 2
-    slope = functional.pad(slope, (1, 1))  # the ends have one neighbour alone
-    image = torch.stack([difference, depth, slope, sees.to(now.dtype), both.to(now.dtype)], -1)
-    return image.unsqueeze(1).permute(0, 3, 1, 2)  # channels innermost in memory, as the encoder wants them
+    slope = functional.pad(slope, (1, 1))  # the first and the last bin have only one neighbour
+    image = torch.stack([difference, depth, slope, has_return.to(now.dtype), both.to(now.dtype)], -1)
+    return image.unsqueeze(1).permute(0, 3, 1, 2)  # channels innermost in memory, for the encoder's layout
 
 
 class LocalConstraints(nn.Module):
-    """The residual motion as the least-squares solution of what is seen at each place.
+    """The residual motion as the weighted least-squares solution of one constraint at each position.
 
-    At place k the network gives a direction u (radial and tangential; its length is free), a lever arm l for
-    the heading, a residual r and a log weight: r = u . (x, y) + l * heading. The normal equations of all
-    places are solved with a prior that says that the guess is right, whose strength is learned; they are the
-    Gauss-Newton step of point-to-line matching with everything in it learned. The inverse of their matrix is
-    the covariance (Cholesky).
+    At each position of the encoder's output the network gives a direction u (radial and tangential, of any
+    length), a lever arm l for the heading, a residual r and a logarithmic weight. The constraint is
+    r = u . (x, y) + l * heading. A prior with learned weights pulls the solution towards zero, i.e. towards
+    the guess. The normal equations are those of a Gauss-Newton step of point-to-line matching, but all their
+    terms are learned. The inverse of their matrix is the covariance.
 
     Args:
         features: channels of the encoder's output.
-        places: bins, with fractions, in whose middle each place of the encoder's output looks, (places,).
-        sensor: the bins drawn.
+        places: (places,) centre of each output position, in bins, with fractions.
+        sensor: defines the bins of the rendered scans.
     """
 
     cos: Tensor
@@ -146,12 +155,19 @@ class LocalConstraints(nn.Module):
         self.register_buffer("sin", torch.from_numpy(np.sin(bearings)).float(), persistent=False)
 
     def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
-        """Motions (N, 3) and their information (N, 3, 3), in ``units``, of features (N, C, 1, places)."""
+        """Solves for the residual motions.
+
+        Args:
+            features: (N, C, 1, places) output of the encoder.
+
+        Returns:
+            Motions (N, 3) and their information matrices (N, 3, 3), in :attr:`ResidualNetwork.units`.
+        """
         with torch.autocast(features.device.type, enabled=False):
             radial, tangential, lever, residual, log_weight = (
                 self.constraint(features.float()).squeeze(-2).unbind(1)
             )
-            weight = log_weight.clamp(*LOG_WEIGHT).exp()
+            weight = log_weight.clamp(*LOG_WEIGHT_BOUNDS).exp()
             rows = torch.stack(
                 [
                     self.cos * radial - self.sin * tangential,
@@ -169,12 +185,17 @@ class LocalConstraints(nn.Module):
 
 
 def factor(matrix: Tensor) -> tuple[Tensor, ...]:
-    """The Cholesky factor of symmetric positive definite matrices (..., 3, 3), written out.
+    """The Cholesky factors of symmetric positive definite matrices (..., 3, 3).
+
+    They are computed element by element, because ONNX has no operator for them. Pivots that rounding errors
+    would make negative are replaced by a millionth of the diagonal entry.
 
     Returns:
-        Its elements (...) l11, l21, l22, l31, l32 and l33.
+        The elements l11, l21, l22, l31, l32 and l33 of the factors, each of shape (...).
 
-    Exported files have no operator for it. What rounding would make negative stays a millionth of its entry.
+    Example:
+        >>> [float(element) for element in factor(torch.diag(torch.tensor([4.0, 9.0, 16.0])))]
+        [2.0, 0.0, 3.0, 0.0, 0.0, 4.0]
     """
     a, b, c, d, e, f = (matrix[..., i, j] for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)))
     l11 = a.sqrt()
@@ -186,9 +207,14 @@ def factor(matrix: Tensor) -> tuple[Tensor, ...]:
 
 
 def invert(matrix: Tensor) -> Tensor:
-    """The inverse (..., 3, 3) of symmetric positive definite matrices."""
+    """The inverses of symmetric positive definite matrices (..., 3, 3).
+
+    Example:
+        >>> invert(torch.diag(torch.tensor([4.0, 16.0, 1.0]))).diagonal().tolist()
+        [0.25, 0.0625, 1.0]
+    """
     l11, l21, l22, l31, l32, l33 = factor(matrix)
-    # The inverse of the factor, below whose diagonal these stand.
+    # The elements of the inverse of the factor.
     m11, m22, m33 = 1 / l11, 1 / l22, 1 / l33
     m21 = -l21 * m11 * m22
     m32 = -l32 * m22 * m33
@@ -199,22 +225,29 @@ def invert(matrix: Tensor) -> Tensor:
 
 
 def log_determinant(matrix: Tensor) -> Tensor:
-    """The logarithm of the determinant (...) of symmetric positive definite matrices (..., 3, 3)."""
+    """The logarithms (...) of the determinants of symmetric positive definite matrices (..., 3, 3).
+
+    Example:
+        >>> round(float(log_determinant(2 * torch.eye(3))), 4)  # log 8
+        2.0794
+    """
     l11, _, l22, _, _, l33 = factor(matrix)
     return 2 * (l11.log() + l22.log() + l33.log())
 
 
 class ResidualNetwork(TrainedModel):
-    """What measures residual motions: how it is trained, used in a drive, and calibrated.
+    """Base class of the networks that measure residual motions: their training, use and calibration.
 
-    A subclass has :meth:`measure` and :meth:`draw`.
+    A subclass defines :meth:`measure` and ``loss``.
 
     Attributes:
-        units: (3,) metres, metres and radians in which the head solves and the loss compares, so that all
-            three count alike.
-        warping: how it is used in a stream.
-        typical_change: (3,) root mean square of the change of training steps, metres and radians.
-        scale: (3,) by which its deviations are multiplied, fitted on validation drives; 1 before.
+        units: (3,) units of x, y (metres) and heading (radians) in which the head solves and in which the
+            loss compares, so that errors of the three are of similar size.
+        warping: how the network is used in a stream of scans.
+        drawn: the sensor with the bins into which scans are rendered.
+        typical_change: (3,) root mean square of the difference between consecutive training steps, in metres,
+            metres and radians.
+        scale: (3,) factors of the standard deviations, fitted on validation drives; 1 before calibration.
     """
 
     only_in_training: ClassVar[tuple[str, ...]] = (
@@ -239,42 +272,51 @@ class ResidualNetwork(TrainedModel):
         self.register_buffer("units", torch.tensor([1.0, 1.0, options["radians_a_metre"]]), persistent=False)
 
     def set_units(self, steps: FloatArray) -> None:
-        """Also told how much steps change."""
+        """Also computes ``typical_change`` from the steps (N, 3) of the training drives."""
         super().set_units(steps)
         self.typical_change.copy_(torch.from_numpy(np.sqrt(np.square(np.diff(steps, axis=0)).mean(0))))
 
     def take_weights(self, model: TrainedModel) -> None:
-        """Keeps how much the new steps change, too."""
+        """Also keeps ``typical_change`` of the new training drives."""
         typical_change = self.typical_change.clone()
         super().take_weights(model)
         self.typical_change.copy_(typical_change)
 
     def describe(self) -> Description:
-        """Also how it is used."""
+        """The description with ``warping`` and ``typical_change``."""
         x, y, heading = self.typical_change.double().tolist()
         return replace(super().describe(), warping=self.warping, typical_change=(x, y, heading))
 
     @abstractmethod
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Residual motions of drawn pairs (B, T, 2, bins drawn).
+        """Measures the residual motions of pairs of rendered scans.
+
+        Args:
+            pairs: (B, T, 2, rendered bins) metres; the earlier scan, seen from the guess, is the first.
+            state: as returned for the pairs before; empty at the beginning.
 
         Returns:
-            The motions (B, T, 3) and their information (B, T, 3, 3), in ``units``, and the state after them.
+            The motions (B, T, 3) and their information matrices (B, T, 3, 3), in ``units``, and the state
+            after the last pair.
         """
 
     def forward(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Residual motions of drawn pairs (B, T, 2, bins drawn), the guess's scan first.
+        """Measures the residual motions in metres and radians, with calibrated covariances.
+
+        Args:
+            pairs: (B, T, 2, rendered bins) metres; the earlier scan, seen from the guess, is the first.
+            state: as returned for the pairs before; empty at the beginning.
 
         Returns:
-            Where each later scan was taken, seen from where the guess says (B, T, 3), in metres and radians;
-            covariances (B, T, 3, 3); and the state.
+            The true pose of each later scan in the frame of its guessed pose (B, T, 3); the covariances
+            (B, T, 3, 3); and the state after the last pair.
         """
         motion, matrix, state = self.measure(pairs, state)
         units = self.units * self.scale
         return motion * self.units, invert(matrix) * units * units.unsqueeze(-1), state
 
     def estimate_scans(self, scans: Tensor) -> Steps:
-        """The steps of encoded scans (N, bins): as in a stream, in full precision."""
+        """The steps of encoded scans (N, bins), as in a stream, in full precision."""
         values = scans.cpu().numpy()
         with torch.autocast(scans.device.type, enabled=False):
             return estimate_pairs(
@@ -282,9 +324,9 @@ class ResidualNetwork(TrainedModel):
             )
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
-        """Fits the scale of the deviations as well: 68.27 % of the errors lie within one of them.
+        """Also fits ``scale``, so that 68.27 % of the errors lie within one standard deviation.
 
-        No period is kept: what is left of a motion is measured at any rate of scans.
+        ``period`` remains nan, because residual motions can be measured at any rate of scans.
         """
         super().calibrate(drives)
         self.period.fill_(torch.nan)
@@ -298,23 +340,32 @@ class ResidualNetwork(TrainedModel):
         if not known.any():
             return
         ratios = np.abs(errors[known]) / np.sqrt(variances[known])
-        self.scale.copy_(torch.from_numpy(np.maximum(np.quantile(ratios, WITHIN, axis=0), 1e-3)))
+        self.scale.copy_(torch.from_numpy(np.maximum(np.quantile(ratios, WITHIN_DEVIATION, axis=0), 1e-3)))
 
     def compare_residuals(self, motion: Tensor, matrix: Tensor, truth: Tensor) -> dict[str, Tensor]:
-        """The loss of motions (N, 3) with information (N, 3, 3), in ``units``; truth (N, 3) in metres and
-        radians.
+        """The loss of estimated residual motions.
 
-        An error counts by the size of the residual motion, so that small ones are measured finely; below
-        ``floor`` (in ``units``) all count alike.
+        Each error is divided by the size of the true residual motion, so that small motions are learned as
+        accurately as large ones in relation to their size. The option ``floor`` (in ``units``), which is
+        added to the size, limits this for very small motions.
+
+        Args:
+            motion: (N, 3) estimates, in ``units``.
+            matrix: (N, 3, 3) their information matrices, in ``units``.
+            truth: (N, 3) true residual motions in metres and radians.
+
+        Returns:
+            The scalars ``loss``, ``loss_relative`` and ``loss_likelihood``; and ``diverged`` (N,), True for
+            estimates that are not finite.
         """
         truth = truth / self.units
         error = motion - truth
         relative = error.norm(dim=-1) / (truth.norm(dim=-1) + self.options["floor"])
-        # Not as a product of matrices, which autocast would round to bf16.
+        # Written without a matrix product, because autocast would round that to bf16.
         squares = (error.unsqueeze(-1) * matrix * error.unsqueeze(-2)).sum((-1, -2))
         likelihood = (squares - log_determinant(matrix)) / 2
         return {
-            "loss": relative.mean() + COVARIANCE_PART * likelihood.mean(),
+            "loss": relative.mean() + LIKELIHOOD_WEIGHT * likelihood.mean(),
             "loss_relative": relative.mean(),
             "loss_likelihood": likelihood.mean(),
             "diverged": ~error.isfinite().all(-1),
@@ -329,53 +380,60 @@ class ResidualNetwork(TrainedModel):
         rng: np.random.Generator,
         device: torch.device,
     ) -> tuple[Tensor, Tensor]:
-        """Pairs of scans as the network sees them, half of the windows mirrored where that is exact.
+        """Renders pairs of scans as input of the network, and mirrors half of the windows.
+
+        Windows are only mirrored if the laser faces forward or backward, because other lasers would cover
+        another sector in the mirror image.
 
         Args:
             earlier, later: (..., bins) metres.
-            guesses: (..., 3) where the later scan seems to have been taken, seen from the earlier one.
-            residuals: (..., 3) where it was taken, seen from there.
-            rng: decides which windows, of the first dimension, are mirrored.
-            device: of what is returned.
+            guesses: (..., 3) guessed poses of the later scans in the frames of the earlier ones.
+            residuals: (..., 3) true poses of the later scans in the frames of the guesses; those of mirrored
+                windows are changed in place.
+            rng: selects the windows, of the first dimension, that are mirrored.
+            device: device of the returned tensors.
 
         Returns:
-            Drawn pairs (..., 2, bins drawn) and residuals (..., 3).
+            Rendered pairs (..., 2, rendered bins) and residuals (..., 3).
         """
         flat, threads = (-1, self.sensor.bins), torch.get_num_threads()
-        viewpoints, here = guesses.reshape(-1, 3), np.zeros((residuals.size // 3, 3))
+        viewpoints, unmoved = guesses.reshape(-1, 3), np.zeros((residuals.size // 3, 3))
         before = render_many(earlier.reshape(flat), self.sensor, viewpoints, self.drawn, threads)
-        now = render_many(later.reshape(flat), self.sensor, here, self.drawn, threads)
+        now = render_many(later.reshape(flat), self.sensor, unmoved, self.drawn, threads)
         pairs = np.stack([before, now], 1).reshape(*residuals.shape[:-1], 2, self.drawn.bins)
-        if self.sensor.facing_deg % 180 == 0:  # the mirror image of any other laser is another laser
+        if self.sensor.facing_deg % 180 == 0:
             mirrored = rng.random(len(pairs)) < 0.5
             pairs[mirrored] = pairs[mirrored, ..., ::-1]
             residuals[mirrored, ..., 1:] *= -1
         return torch.from_numpy(pairs).to(device), torch.from_numpy(residuals).float().to(device)
 
     def draw_residual(self, step: FloatArray, rng: np.random.Generator) -> FloatArray:
-        """How far off a guess of a step (3,) is: (3,) in metres and radians."""
+        """A random residual motion (3,) in metres and radians, for a guess of a true step (3,).
+
+        The whole step is returned in some cases: then the guess assumes no motion.
+        """
         x, y, heading = np.abs(step)
-        if rng.random() < FROM_REST and max(x, y) < FARTHEST_FROM_REST and heading < SHARPEST_FROM_REST:
+        if rng.random() < REST_FRACTION and max(x, y) < LARGEST_REST_DISTANCE and heading < LARGEST_REST_TURN:
             return step
         options = ResidualOptions(**self.options["residual"])
         deviations = np.array([options.x, options.y, math.radians(options.heading_deg)])
-        # A scale for each of the three: with one for all, the network would infer the size of one part of the
-        # residual from the others, and along a corridor take a guess for right since its heading is.
-        scale = 10 ** rng.uniform(options.smallest, options.largest, 3)
+        # A common scale: with one for each, small residuals get rarer, and are measured less finely
+        # (docs/warp.md).
+        scale = 10 ** rng.uniform(options.smallest, options.largest)
         drawn: FloatArray = deviations * rng.standard_normal(3) * scale
         return drawn
 
 
-def windows_of(batch: Batch) -> tuple[DepthVector, FloatArray]:
-    """Scans (B, T + 1, bins) of a batch of windows, and their poses (B, T + 1, 3) seen from the first.
+def find_scans_and_poses(batch: Batch) -> tuple[DepthVector, FloatArray]:
+    """The scans (B, T + 1, bins) of a batch of windows, and their poses (B, T + 1, 3) relative to the first.
 
     Raises:
-        InputError: the pairs of a window do not share their scans.
+        InputError: the second scan of a pair differs from the first scan of the next pair.
     """
     if not torch.equal(batch["pairs"][:, 1:, 0], batch["pairs"][:, :-1, 1]):
         raise InputError(
-            "data.augment.max_turn_deg: turns the second scan of each pair by itself; networks that draw "
-            "their own guesses have no use for it; leave it out"
+            "data.augment.max_turn_deg: it turns only the second scan of each pair, which does not work with "
+            "networks that measure residual motions; remove this option"
         )
     scans = torch.cat([batch["pairs"][:, :, 0], batch["pairs"][:, -1:, 1]], 1).cpu().numpy()
     steps = batch["steps"].double().cpu().numpy()
@@ -383,12 +441,12 @@ def windows_of(batch: Batch) -> tuple[DepthVector, FloatArray]:
 
 
 def seeded_generator() -> np.random.Generator:
-    """Draws what torch's seed says: a training that goes on so draws what it would have drawn."""
+    """A random generator seeded by torch's, so that a resumed training continues with the same numbers."""
     return np.random.default_rng(int(torch.randint(2**62, ())))
 
 
 class CNNWarp(ResidualNetwork):
-    """The paper's encoder over a pair of drawn scans, and local constraints: no memory of its own."""
+    """The paper's encoder for a pair of rendered scans, and local constraints; it has no state."""
 
     name = "cnn_warp"
     Options = WarpOptions
@@ -399,20 +457,24 @@ class CNNWarp(ResidualNetwork):
         self.head = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
 
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
-        """Motions (B, T, 3) and their information (B, T, 3, 3), in ``units``, and the state."""
+        """Motions (B, T, 3) and their information matrices (B, T, 3, 3), in ``units``, and the state."""
         features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
         motion, matrix = self.head(features)
         return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """The error of residual motions by their size, and the likelihood that teaches the covariances."""
+        """The loss of one random pair of scans of each window, see :meth:`compare_residuals`."""
         pairs, residuals = self.draw(batch)
         motion, matrix, _ = self.measure(pairs.unsqueeze(1))
         return self.compare_residuals(motion[:, 0], matrix[:, 0], residuals)
 
     def draw(self, batch: Batch) -> tuple[Tensor, Tensor]:
-        """A pair of scans of each window with a guess: drawn pairs (B, 2, bins drawn), residuals (B, 3)."""
-        scans, poses = windows_of(batch)
+        """Selects two scans of each window, in any order, and draws a guess of their motion.
+
+        Returns:
+            Rendered pairs (B, 2, rendered bins) and residual motions (B, 3) in metres and radians.
+        """
+        scans, poses = find_scans_and_poses(batch)
         rng = seeded_generator()
         chosen = np.array([rng.choice(scans.shape[1], 2, replace=False) for _ in scans])
         earlier, later = (scans[np.arange(len(scans)), which] for which in chosen.T)

@@ -1,4 +1,4 @@
-"""Baselines that repeat one step: an estimate has to be better than these, which use no scan."""
+"""Baselines that repeat one step and use no scans; estimates have to be better than these."""
 
 import logging
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ log = logging.getLogger(__name__)
 
 @dataclass(frozen=True, eq=False)
 class ConstantStep:
-    """The same step for every pair of scans: the training drives' mean, for instance.
+    """Gives the same step for every pair of scans, for instance the mean of the training drives.
 
     Attributes:
         step: (3,) x and y in metres, heading in radians.
@@ -25,33 +25,38 @@ class ConstantStep:
     step: FloatArray
 
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive."""
+        """The steps of a whole drive, with unknown covariances."""
         return Steps.with_unknown_covariance(np.tile(self.step, (len(drive) - 1, 1)))
 
 
 def held_motion() -> ConstantStep:
-    """Repeats its own last estimate, and begins at rest: the odometry that never moves.
+    """The baseline that begins at rest and repeats its last estimate, so that it never moves.
 
-    It is what a matcher that holds its last motion on failure amounts to when it fails from the start.
+    A matcher that repeats its last motion after a failure does the same if it fails from the start.
+
+    Example:
+        >>> held_motion().step.tolist()
+        [0.0, 0.0, 0.0]
     """
     return ConstantStep(np.zeros(3))
 
 
 def mean_step(open_recording: OpenRecording, names: Sequence[str]) -> FloatArray | None:
-    """The mean step (3,) of training drives; None, and a line in the log, where one cannot be read.
+    """The mean step (3,) of training drives; None, with a log message, if one of them cannot be read.
 
     Args:
-        open_recording: name -> recording, of which the truth is needed and no scan.
-        names: of the drives or of parts of them, as in ``data.train``.
+        open_recording: opens a recording by its name; only the true poses are used, not the scans.
+        names: names of drives or of parts of them, as in ``data.train``.
     """
     try:
-        steps = [_without_scans(open_recording, name).steps for name in names]
+        steps = [_open_without_scans(open_recording, name).steps for name in names]
     except InputError as error:
-        log.info("mean_motion is left out, since not all of data.train can be read: %s", error)
+        log.info("mean_motion is left out, because not all of data.train can be read: %s", error)
         return None
     return np.concatenate(steps).mean(0)  # type: ignore[no-any-return]
 
 
-def _without_scans(open_recording: OpenRecording, name: str) -> Drive:
+def _open_without_scans(open_recording: OpenRecording, name: str) -> Drive:
+    """The drive, or part of a drive, with this name, without encoding its scans."""
     recording = open_recording(parse_part(name).file)
     return cut({recording.name: Drive.unencoded(recording)}, name)

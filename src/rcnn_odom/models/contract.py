@@ -1,6 +1,6 @@
-"""What every estimator is: scans in, steps out; trained or not. Needs numpy alone.
+"""The interface of every estimator, trained or not: scans in, steps out. This module needs only numpy.
 
-A model is one file in this package and one in ``conf/model``; docs/extending.md writes one.
+A model is one file in this package and one file in ``conf/model``; docs/extending.md has an example.
 """
 
 import inspect
@@ -14,7 +14,7 @@ from rcnn_odom.geometry import Steps
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.pairs import PairTracker
 
-# Also what a model is made of in a stream, so that one import brings all of the contract.
+# The interfaces of a model in a stream, which are imported here so that this module has all interfaces.
 from rcnn_odom.models.streaming import Description as Description
 from rcnn_odom.models.streaming import Registered as Registered
 from rcnn_odom.models.streaming import ScanTracker as ScanTracker
@@ -24,20 +24,20 @@ from rcnn_odom.registry import choose, collect, modules_in
 
 
 class Model(ABC):
-    """An estimator.
+    """Base class of all estimators.
 
     Args:
-        options: those of ``conf/model``, checked against ``Options``.
-        sensor: how scans are encoded for it, ``data.sensor``.
+        options: the options of ``conf/model``, checked against ``Options``.
+        sensor: defines how scans are encoded for the model (``data.sensor``).
 
     Attributes:
-        name: by which ``model=NAME`` and checkpoints find it.
-        Options: a dataclass of its options; see :mod:`rcnn_odom.options` for bounds.
-        trains: whether ``train.py`` has something to do; then it is a
+        name: the name in ``model=NAME`` and in checkpoints.
+        Options: a dataclass of the options; see :mod:`rcnn_odom.options` for bounds of their values.
+        trains: whether the model can be trained by ``train.py``; then it is a subclass of
             :class:`rcnn_odom.models.trained.TrainedModel`.
-        uses_depth_vectors: whether it looks at ``Drive.scans``, which are not made for it otherwise.
-        deskew: ``data.deskew``, for a model of whole scans: whether it takes the motion of the laser within a
-            scan out of it, ``on`` or ``off``; ``auto``: unless ``Drive.is_compensated``.
+        uses_depth_vectors: whether the model uses ``Drive.scans``; otherwise scans are not encoded for it.
+        deskew: ``data.deskew``, for models of whole scans: ``on`` or ``off``, whether the model corrects
+            scans for the motion of the laser during the scan; ``auto``: unless ``Drive.is_compensated``.
     """
 
     name: ClassVar[str]
@@ -53,30 +53,40 @@ class Model(ABC):
 
     @abstractmethod
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive."""
+        """The steps of a whole drive."""
 
     def stepper(self) -> Stepper:
-        """The same one pair of encoded scans after the other; a model that looks at whole scans has none."""
-        raise NotImplementedError(f"{self.name} looks at whole scans; it has a tracker")
+        """The model in a stream of encoded scans, one pair after the other.
+
+        Raises:
+            NotImplementedError: the model uses whole scans; it has only a tracker.
+        """
+        raise NotImplementedError(f"{self.name} uses whole scans; call tracker() instead of stepper()")
 
     def tracker(self) -> ScanTracker:
-        """The same one scan after the other; a model that looks at whole scans has one of its own."""
+        """The model in a stream of scans, one after the other; a model of whole scans overrides it."""
         return PairTracker(self.stepper())
 
 
 NEEDED = ("name", "Options", "estimate")
+"""Attributes that every model must have."""
 NEEDED_IN_A_STREAM = ("stepper", "tracker")
-"""One of them is needed."""
+"""Every model must define at least one of these."""
 NEEDED_TO_TRAIN = ("forward", "loss")
+"""Attributes that a model must have if it can be trained."""
 RECIPE = {"epochs", "learning_rate", "window", "batch_size"}
 """Options of every training, see :class:`rcnn_odom.models.trained.Recipe`."""
 
 
 def check_model(name: str, model: Any) -> None:
-    """Looks whether a class is a model.
+    """Checks that a class is a model.
+
+    Args:
+        name: the name under which it is registered.
+        model: the class.
 
     Raises:
-        InputError: a part of the contract is missing; the message says which.
+        InputError: a part of the interface is missing; the message says which.
     """
     trains = getattr(model, "trains", False)
     needed = NEEDED + (NEEDED_TO_TRAIN if trains else ())
@@ -93,24 +103,24 @@ def check_model(name: str, model: Any) -> None:
     if missing:
         problem = f"lacks {', '.join(missing)}"
     elif not (inspect.isclass(model) and issubclass(model, Model)):
-        problem = f"is no subclass of {Model.__name__}"
+        problem = f"is not a subclass of {Model.__name__}"
     elif not is_dataclass(model.Options):
         problem = "has Options that are no dataclass"
     elif model.name != name:
         problem = f"its class is named {model.name}; both must be the same"
     else:
         return
-    raise InputError(f"model {name}: {problem}; docs/extending.md says what a model has")
+    raise InputError(f"model {name}: {problem}; docs/extending.md describes what a model needs")
 
 
 def all_models(only: str | None = None) -> dict[str, type[Model]]:
-    """Every model by its name; imports all of them, and so torch.
+    """All models by their names; imports all of them, including torch.
 
     Args:
-        only: of those of other packages import the one of this name alone.
+        only: of the models of other packages, import only the one with this name; None: import all.
 
     Raises:
-        InputError: two have the same name, or one lacks a part.
+        InputError: two models have the same name, or a part of the interface is missing.
     """
     built_in: dict[str, type[Model]] = {}
     for module in chain(modules_in("rcnn_odom.models"), modules_in("rcnn_odom.models.peers")):
@@ -125,10 +135,14 @@ def all_models(only: str | None = None) -> dict[str, type[Model]]:
 
 
 def find_model(name: str) -> type[Model]:
-    """The model of this name.
+    """The model with this name.
 
     Raises:
-        InputError: there is none, or as :func:`all_models`.
+        InputError: there is no such model, or as in :func:`all_models`.
+
+    Example:
+        >>> find_model("matcher").__name__
+        'Matcher'
     """
     found: type[Model] = choose("model", name, all_models(only=name))
     return found

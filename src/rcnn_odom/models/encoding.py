@@ -1,4 +1,4 @@
-"""Points of one revolution -> depth vector (paper III-A). Nothing else knows about bins."""
+"""Encodes the points of one revolution as a depth vector (paper III-A)."""
 
 from dataclasses import asdict, dataclass
 from typing import Any
@@ -13,13 +13,20 @@ from rcnn_odom.recordings.scan import Scan
 
 @dataclass(frozen=True)
 class Sensor:
-    """A 2D laser as the network sees it.
+    """The layout of the depth vectors of a 2D laser.
 
     Attributes:
         resolution_deg: width of a bin in degrees.
-        field_of_view_deg: angle covered, in degrees.
-        max_range: metres; readings at or beyond it are absent returns, not walls.
-        facing_deg: direction of the middle of what is covered, counter-clockwise from straight ahead.
+        field_of_view_deg: covered angle in degrees.
+        max_range: metres; ranges of this or more are no returns.
+        facing_deg: direction of the middle of the field of view, in degrees counter-clockwise from ahead.
+
+    Raises:
+        InputError: the field of view is not a whole number of bins, or a value is outside its bounds.
+
+    Example:
+        >>> Sensor().bins
+        3601
     """
 
     resolution_deg: float = option(default=0.1, above=0)
@@ -52,43 +59,53 @@ class Sensor:
         return self.facing_deg - self.field_of_view_deg / 2
 
     def encode(self, scan: Scan) -> npt.NDArray[np.float32]:
-        """The depth vector (bins,) of a scan in metres.
+        """The depth vector (bins,) of a scan in metres, 0 without a return.
 
-        Beams without bearings are spread evenly over the field of view.
+        If the scan has no bearings, its beams are assumed to cover the field of view evenly.
         """
         return encode(self.bearings_of(scan), scan.ranges, self)
 
     def bearings_of(self, scan: Scan) -> npt.NDArray[np.float64]:
-        """Bearings (P,) of a scan's beams in radians, spread evenly over the field of view where unknown."""
+        """Bearings (P,) of a scan's beams in radians; if unknown, even ones over the field of view."""
         if scan.bearings is not None:
             return scan.bearings
         low, high = np.deg2rad([self.first_bin_deg, self.first_bin_deg + self.field_of_view_deg]).tolist()
         return np.linspace(low, high, len(scan.ranges), endpoint=self.field_of_view_deg != 360)
 
     def as_dict(self) -> dict[str, Any]:
-        """Plain numbers, for checkpoints and cache keys; those of a laser that looks ahead as ever."""
+        """The attributes as plain numbers, for checkpoints and cache keys.
+
+        ``facing_deg`` is left out if it is 0, so that keys of older versions remain valid.
+        """
         return {key: value for key, value in asdict(self).items() if key != "facing_deg" or value}
 
 
 def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.NDArray[np.float32]:
-    """Mean depth of the returns in every bin, 0 where there is none (paper III-A).
+    """Computes the mean range of the returns in every bin (paper III-A).
 
     Bin i is centred on ``facing - field_of_view / 2 + i * resolution`` degrees from straight ahead,
-    counter-clockwise. On a full circle the first and the last bin are the same direction, backwards.
+    counter-clockwise. On a full circle the first and the last bin have the same direction.
 
     Args:
-        angles: (P,) radians, any turn of the circle, 0 straight ahead.
-        ranges: (P,) metres. Not finite, not positive, or at least ``sensor.max_range``: no return.
+        angles: (P,) radians, 0 straight ahead; they may lie outside of one turn.
+        ranges: (P,) metres. Ranges that are not finite, not positive, or at least ``sensor.max_range`` are no
+            returns.
+        sensor: defines the bins.
 
     Returns:
-        (bins,) metres.
+        The depth vector (bins,) in metres, 0 without a return.
+
+    Example:
+        >>> sensor = Sensor(resolution_deg=45.0, field_of_view_deg=90.0)
+        >>> encode([0.0, 0.1, np.pi / 4], [2.0, 4.0, 5.0], sensor).tolist()
+        [0.0, 3.0, 5.0]
     """
     angles = np.asarray(angles, dtype=np.float64)
     ranges = np.asarray(ranges, dtype=np.float64)
-    with np.errstate(over="ignore"):  # of angles that no turn of the circle explains
+    with np.errstate(over="ignore"):  # for faulty angles that are extremely large
         degrees = np.rad2deg(angles)
     returned = (ranges > 0) & (ranges < sensor.max_range) & np.isfinite(degrees)
-    # Turned so that bin 0 begins at 0: rounding never splits the bin behind the laser.
+    # Turned so that bin 0 begins at 0; otherwise rounding could split the bin behind the laser.
     turned = degrees[returned] + (sensor.resolution_deg / 2 - sensor.first_bin_deg)
     index = np.floor((turned % 360.0) / sensor.resolution_deg + 1e-9).astype(np.int64)
     closes_circle = sensor.field_of_view_deg == 360
@@ -107,7 +124,14 @@ def encode(angles: npt.ArrayLike, ranges: npt.ArrayLike, sensor: Sensor) -> npt.
 
 
 def decode(depth: npt.NDArray[np.float32], sensor: Sensor) -> npt.NDArray[np.float64]:
-    """Points (P, 2) in metres, x ahead and y to the left, in the middles of bins (bins,) with a return."""
+    """The points (P, 2) of a depth vector (bins,), in metres, in the middles of the bins with a return.
+
+    x points ahead and y to the left.
+
+    Example:
+        >>> decode(np.array([0.0, 3.0, 0.0]), Sensor(resolution_deg=45.0, field_of_view_deg=90.0)).tolist()
+        [[3.0, 0.0]]
+    """
     distinct = depth[:-1] if sensor.field_of_view_deg == 360 else depth
     bins = np.flatnonzero(distinct)
     angles = np.deg2rad(bins * sensor.resolution_deg + sensor.first_bin_deg)

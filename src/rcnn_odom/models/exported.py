@@ -1,4 +1,4 @@
-"""A trained network as it runs on a robot, a shipped one or an exported file, scored like any model."""
+"""An exported network as it runs on a robot, as a model that can be evaluated like any other."""
 
 from dataclasses import dataclass
 from typing import Any, ClassVar
@@ -16,24 +16,29 @@ from rcnn_odom.recordings.recording import Drive
 
 @dataclass(frozen=True)
 class ExportedOptions:
-    """What ``conf/model/exported.yaml`` sets.
+    """The options of ``conf/model/exported.yaml``.
 
     Attributes:
-        network: a network that ships with the project, or a file of ``rcnn-odom export``.
+        network: name of a network that ships with the project, or path of a file that ``rcnn-odom export``
+            has written.
+
+    Example:
+        >>> ExportedOptions()
+        ExportedOptions(network='all_round')
     """
 
     network: str = option(
         default="all_round",
         fits=lambda network: bool(network.strip()),
-        wanted="a network that ships along, or a file of rcnn-odom export",
+        wanted="the name of a shipped network, or a file that rcnn-odom export has written",
     )
 
 
 class Exported(Model):
-    """A network in ONNX Runtime, on whole scans, which its own sensor encodes.
+    """A network in ONNX Runtime, whose own sensor encodes the scans.
 
     Raises:
-        InputError: no such network, or not one of ``rcnn-odom export``.
+        InputError: there is no such network, or ``rcnn-odom export`` has not written its file.
     """
 
     name = "exported"
@@ -45,9 +50,9 @@ class Exported(Model):
         self._stepper = OnnxStepper(find_file(ExportedOptions(**options).network))
 
     def tracker(self) -> PairTracker:
-        """The same in a stream."""
+        """The tracker for a stream of scans."""
         return PairTracker(self._stepper)
 
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive, those that ``rcnn-odom run --model`` gives."""
+        """The steps of a whole drive, which equal those of ``rcnn-odom run --model``."""
         return estimate_by_tracking(self.tracker(), drive.raw_scans())

@@ -1,4 +1,4 @@
-"""A Kalman filter of a motion that changes little from scan to scan; needs numpy alone."""
+"""A Kalman filter of pose and motion with nearly constant velocity; this module needs only numpy."""
 
 import math
 from typing import NamedTuple
@@ -9,41 +9,50 @@ from rcnn_odom.geometry import FloatArray, advance, turn_covariance
 
 
 class _Predicted(NamedTuple):
-    """Covariances (3, 3) of the errors at a later scan, in the frame of the last one.
+    """Predicted covariances (3, 3) of the errors at a later scan, in the frame of the last scan.
 
     Attributes:
-        pose: of the pose beside the key if the motion were known.
-        moved: of the motion over the periods between.
-        pose_and_moved: of these two with each other.
-        motion: of the motion from scan to scan at the later scan.
-        pose_and_motion: of the pose there, with all its errors, and of that motion with each other.
+        pose: part of the pose's covariance that comes from the pose of the last scan. All poses are relative
+            to the key scan.
+        shift: part that comes from the motion between the two scans.
+        pose_and_shift: cross-covariance of these two errors.
+        motion: covariance of the motion per period at the later scan.
+        pose_and_motion: cross-covariance of the whole error of the predicted pose and that of the motion.
     """
 
     pose: FloatArray
-    moved: FloatArray
-    pose_and_moved: FloatArray
+    shift: FloatArray
+    pose_and_shift: FloatArray
     motion: FloatArray
     pose_and_motion: FloatArray
 
     @property
-    def expected(self) -> FloatArray:
-        """Of the pose beside the key, with all its errors."""
-        return self.pose + self.moved + self.pose_and_moved + self.pose_and_moved.T
+    def whole_pose(self) -> FloatArray:
+        """Covariance of the whole error of the predicted pose."""
+        return self.pose + self.shift + self.pose_and_shift + self.pose_and_shift.T
 
 
 class MotionFilter:
-    """Where the next scan is expected, and how much of what is measured there is believed.
+    """Predicts the pose of the next scan and corrects it by a measurement.
 
-    Its state are the pose beside a key scan and the motion from scan to scan (a model of constant velocity).
-    Where a measurement tells little, the motion goes on nearly as before, instead of taking the measurement's
-    errors up in every scan; where it tells much, the measurement is all.
+    The state is the pose relative to a key scan and the motion per period (a model of constant velocity). In
+    directions where a measurement is inaccurate, the motion continues nearly as before and does not follow
+    the measurement's errors. In directions where it is accurate, the estimate equals the measurement.
 
     Args:
-        change: (3,) deviations of the change of the motion from scan to scan, metres and radians.
-        typical: (3,) root mean square of the motions: what is known of the first one.
+        change: (3,) standard deviations of the change of the motion from scan to scan, metres and radians.
+        typical: (3,) root mean square of the motions; twice this is the initial standard deviation.
 
     Attributes:
-        motion: (3,) expected to the next scan, in the frame of the last one.
+        motion: (3,) predicted motion to the next scan, in the frame of the last one.
+
+    Example:
+        An accurate measurement, 1 m ahead of the predicted pose, is used almost unchanged:
+
+        >>> motion_filter = MotionFilter(change=np.full(3, 0.1), typical=np.ones(3))
+        >>> correction, _, _ = motion_filter.correct(np.array([1.0, 0.0, 0.0]), 1e-8 * np.eye(3))
+        >>> correction.round(3).tolist(), motion_filter.motion.round(3).tolist()
+        ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     """
 
     def __init__(self, change: FloatArray, typical: FloatArray) -> None:
@@ -51,96 +60,104 @@ class MotionFilter:
         self.begin()
 
     def begin(self) -> None:
-        """Forgets the motion."""
+        """Forgets pose and motion: the next scan is the first one."""
         self.motion: FloatArray = np.zeros(3)
-        # Errors of pose and motion, both in the frame of the last scan.
+        # Covariance of pose and motion, both in the frame of the last scan.
         self._errors: FloatArray = np.zeros((6, 6))
         self._errors[3:, 3:] = np.diag(np.square(2 * self._typical))
 
     def take_key(self) -> None:
-        """The last scan is the key: its pose beside itself is known."""
+        """Makes the last scan the key scan, so that its relative pose has no error."""
         self._errors[:3], self._errors[:, :3] = 0.0, 0.0
 
     @property
     def pose_covariance(self) -> FloatArray:
-        """(3, 3) of the last scan's pose beside the key, in the scan's own frame."""
+        """Covariance (3, 3) of the last scan's pose relative to the key scan, in the last scan's frame."""
         return self._errors[:3, :3].copy()
 
     def displacement(self, periods: int = 1) -> FloatArray:
-        """The motion (3,) over so many periods, in the frame of the last scan."""
-        moved = self.motion
+        """The predicted displacement (3,) after ``periods`` periods, in the frame of the last scan."""
+        displacement = self.motion
         for _ in range(periods - 1):
-            moved = advance(moved, self.motion)
-        return moved
+            displacement = advance(displacement, self.motion)
+        return displacement
 
     def weigh(self, residual: FloatArray, covariance: FloatArray, periods: int = 1) -> FloatArray:
-        """The part of a residual (3,) that :meth:`correct` would believe; changes nothing."""
-        expected, turn = self._predict(periods).expected, float(self.displacement(periods)[2])
-        gain = expected @ np.linalg.inv(expected + turn_covariance(covariance, turn))
+        """The correction (3,) that :meth:`correct` would return; the state does not change."""
+        pose, turn = self._predict(periods).whole_pose, float(self.displacement(periods)[2])
+        gain = pose @ np.linalg.inv(pose + turn_covariance(covariance, turn))
         return _rotate(gain @ _rotate(residual, turn), -turn)
 
     def predict(self, periods: int = 1) -> tuple[FloatArray, FloatArray]:
-        """Moves on by so many periods in which nothing was measured.
+        """Moves the state on by ``periods`` periods without a measurement.
 
         Returns:
-            The covariance (3, 3) of the step, in the frame of the scan before; and the part of the pose's
-            (3, 3) that the next measurement takes back, which is all of it, in the new scan's own frame.
+            The covariance (3, 3) of the step, in the frame of the scan before; and the covariance (3, 3) of
+            the error that the next step cancels, in the new scan's frame. Here this is the whole error of the
+            pose.
         """
         turn, predicted = float(self.displacement(periods)[2]), self._predict(periods)
-        self._keep(predicted.expected, predicted.pose_and_motion, predicted.motion, turn)
-        return predicted.moved, self.pose_covariance
+        self._store_errors(predicted.whole_pose, predicted.pose_and_motion, predicted.motion, turn)
+        return predicted.shift, self.pose_covariance
 
     def correct(
         self, residual: FloatArray, covariance: FloatArray, periods: int = 1
     ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Takes in what was measured at the next scan.
+        """Moves the state on to the next scan and corrects it by a measurement of that scan's pose.
 
         Args:
-            residual: (3,) where it was measured, seen from where it was expected.
-            covariance: (3, 3) of that.
-            periods: from the last scan to this one.
+            residual: (3,) measured pose in the frame of the predicted pose.
+            covariance: (3, 3) of the residual, in the same frame.
+            periods: periods from the last scan to this one.
 
         Returns:
-            The part of the residual that is believed (3,); the covariance (3, 3) of the step to the scan, in
-            the frame of the scan before; and the part of the pose's (3, 3) that the next measurement takes
-            back, in the scan's own frame.
+            The correction (3,) in the frame of the predicted pose; the covariance (3, 3) of the step to the
+            scan, in the frame of the scan before; and the covariance (3, 3) of the error that the next step
+            cancels, in the new scan's frame (see :class:`rcnn_odom.geometry.Step`).
         """
         predicted, turn = self._predict(periods), float(self.displacement(periods)[2])
-        expected, cross = predicted.expected, predicted.pose_and_motion
-        measured = turn_covariance(covariance, turn)  # in the frame of the scan before, as all here
-        inverse = np.linalg.inv(expected + measured)
-        gain, of_motion = expected @ inverse, cross.T @ inverse
+        pose, cross = predicted.whole_pose, predicted.pose_and_motion
+        measured = turn_covariance(covariance, turn)  # in the frame of the scan before, like all the others
+        inverse = np.linalg.inv(pose + measured)
+        gain, motion_gain = pose @ inverse, cross.T @ inverse
         rest = np.eye(3) - gain
-        both = gain @ predicted.pose_and_moved @ rest.T
-        step = gain @ (predicted.pose + measured) @ gain.T + rest @ predicted.moved @ rest.T - both - both.T
-        seen = _rotate(residual, turn)
-        believed = _rotate(gain @ seen, -turn)
-        after = turn + float(believed[2])
-        self.motion = self.motion + of_motion @ seen
-        self._keep(rest @ expected, rest @ cross, predicted.motion - of_motion @ cross, after)
-        taken = turn_covariance(gain @ rest @ expected, -after)
-        return believed, step, (taken + taken.T) / 2
+        both = gain @ predicted.pose_and_shift @ rest.T
+        step = gain @ (predicted.pose + measured) @ gain.T + rest @ predicted.shift @ rest.T - both - both.T
+        rotated = _rotate(residual, turn)
+        correction = _rotate(gain @ rotated, -turn)
+        after = turn + float(correction[2])
+        self.motion = self.motion + motion_gain @ rotated
+        self._store_errors(rest @ pose, rest @ cross, predicted.motion - motion_gain @ cross, after)
+        taken_back = turn_covariance(gain @ rest @ pose, -after)
+        return correction, step, (taken_back + taken_back.T) / 2
 
     def _predict(self, periods: int) -> "_Predicted":
-        """The errors at a scan so many periods later."""
+        """The covariances at a scan that is ``periods`` periods later."""
         motion, change = self._errors[3:, 3:], np.diag(np.square(self._change))
-        # An error of the heading moves the place that the motion leads to.
+        # An error of the heading also moves the end of the displacement.
         x, y, _ = self.displacement(periods).tolist()
         lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
         both = lever @ self._errors[:3, 3:]
-        # A change of the motion in the first of three periods counts three times, the next one twice, ...
-        once = periods * (periods + 1) / 2
-        squared = once * (2 * periods + 1) / 3
+        # A change of the motion in the first of n periods acts n times, one in the second n - 1 times, etc.
+        # This gives the sums of 1 to n and of their squares.
+        total = periods * (periods + 1) / 2
+        squared = total * (2 * periods + 1) / 3
         return _Predicted(
             pose=lever @ self._errors[:3, :3] @ lever.T,
-            moved=periods**2 * motion + squared * change,
-            pose_and_moved=periods * both,
+            shift=periods**2 * motion + squared * change,
+            pose_and_shift=periods * both,
             motion=motion + periods * change,
-            pose_and_motion=both + periods * motion + once * change,
+            pose_and_motion=both + periods * motion + total * change,
         )
 
-    def _keep(self, pose: FloatArray, both: FloatArray, motion: FloatArray, turn: float) -> None:
-        """The errors after a scan, told of its own frame, which is turned by so many radians."""
+    def _store_errors(self, pose: FloatArray, both: FloatArray, motion: FloatArray, turn: float) -> None:
+        """Stores the covariances after a scan in the scan's own frame, which is turned by ``turn`` radians.
+
+        Args:
+            pose, both, motion: (3, 3) of the pose, of pose and motion with each other, and of the motion, in
+                the frame of the scan before.
+            turn: heading of the scan in that frame.
+        """
         for rows, columns, block in ((0, 0, pose), (0, 3, both), (3, 3, motion)):
             self._errors[rows : rows + 3, columns : columns + 3] = turn_covariance(block, -turn)
         self._errors[3:, :3] = self._errors[:3, 3:].T
@@ -148,6 +165,6 @@ class MotionFilter:
 
 
 def _rotate(values: FloatArray, turn: float) -> FloatArray:
-    """x, y and heading (3,), told of a frame that sees them turned by ``turn`` radians."""
+    """x, y and heading (3,), with x and y rotated counter-clockwise by ``turn`` radians."""
     cos, sin = math.cos(turn), math.sin(turn)
     return np.array([cos * values[0] - sin * values[1], sin * values[0] + cos * values[1], values[2]])

@@ -1,4 +1,4 @@
-"""One pair of scans after the other through an exported network; needs ONNX Runtime and no PyTorch."""
+"""Runs an exported network on one pair of scans after the other, with ONNX Runtime and without PyTorch."""
 
 import json
 from pathlib import Path
@@ -13,23 +13,24 @@ from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.models.streaming import Description, Warping
 
 METADATA = "rcnn_odom"
-"""Key of the file's metadata that holds all that an odometer has to know, as JSON."""
+"""Key in the file's metadata for the network's description, in JSON."""
 FORMAT = 2
-"""Of the files: 1 had the paper's two numbers as output and no ``format`` in its metadata."""
+"""Version of the files: 1 had the paper's two numbers as output and no ``format`` in its metadata."""
 
 
 class OnnxStepper:
-    """A file of ``rcnn-odom export`` as a :class:`rcnn_odom.models.contract.Stepper`.
+    """A :class:`rcnn_odom.models.contract.Stepper` for a file that ``rcnn-odom export`` has written.
 
     Args:
-        file: its path, or what it holds.
-        threads: of the computation.
+        file: path of the file, or its content.
+        threads: number of threads for the computation.
 
     Attributes:
-        metadata: what the file tells of itself; see :func:`rcnn_odom.training.onnx_graph.write`.
+        metadata: metadata of the file; see :func:`rcnn_odom.training.onnx_graph.write`.
+        description: description of the network, from the metadata.
 
     Raises:
-        InputError: no such file, or not one of ``rcnn-odom export`` of this version.
+        InputError: the file does not exist, or ``rcnn-odom export`` of this version has not written it.
     """
 
     def __init__(self, file: str | Path | bytes, threads: int = 1) -> None:
@@ -56,12 +57,12 @@ class OnnxStepper:
 
     def reset(self) -> None:
         """Forgets all earlier pairs."""
-        # An array of its own for h and for c: one for both would make them one state.
+        # Each state needs its own array: h and c must not share one.
         self._state = {name: zeros.copy() for name, zeros in self._initial.items()}
         self._before = self._state
 
     def forget_last(self) -> None:
-        """Forgets the last pair: the next one is compared in its place."""
+        """Restores the state before the last pair, which the next pair replaces."""
         self._state = self._before
 
     def __call__(self, pair: npt.NDArray[np.float32]) -> Step:
@@ -74,16 +75,20 @@ class OnnxStepper:
 
 
 def open_session(file: str | Path | bytes, threads: int = 1) -> Any:
-    """An ``onnxruntime.InferenceSession`` on the CPU.
+    """Opens an ``onnxruntime.InferenceSession`` on the CPU.
+
+    Args:
+        file: path of the file, or its content.
+        threads: number of threads for the computation.
 
     Raises:
-        InputError: the file cannot be read or is no ONNX graph that ONNX Runtime knows.
+        InputError: the file cannot be read, or ONNX Runtime cannot run it.
     """
     import onnxruntime
 
     options = onnxruntime.SessionOptions()
     options.intra_op_num_threads = threads
-    # Threads that wait by spinning take the cores from whatever else runs on a robot.
+    # Threads that wait by spinning would occupy the cores that other programs of the robot need.
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.log_severity_level = 3
     if not isinstance(file, bytes) and not Path(file).is_file():
@@ -91,15 +96,19 @@ def open_session(file: str | Path | bytes, threads: int = 1) -> Any:
     source = file if isinstance(file, bytes) else str(file)
     try:
         return onnxruntime.InferenceSession(source, options, providers=["CPUExecutionProvider"])
-    except Exception as error:  # whatever the bytes of a stranger's file lead to
+    except Exception as error:  # the content of an unknown file can cause any error
         reason = str(error).splitlines()[0].replace(f"{source!s} ", "")
         raise InputError(
-            f"{file!s:.200}: no ONNX file that can be run ({reason}); export it again"
+            f"{file!s:.200}: not an ONNX file that can be run ({reason}); export it again"
         ) from error
 
 
 def _describe(metadata: dict[str, Any]) -> Description:
-    """What the metadata say of the network; null is nan."""
+    """The description of the network from the file's metadata, in which null stands for nan.
+
+    Raises:
+        KeyError, TypeError, ValueError, InputError: the metadata are incomplete or wrong.
+    """
     values = [*metadata["typical_step"], metadata["least_filled"], metadata["period"]]
     x, y, heading, filled, period = (np.nan if value is None else float(value) for value in values)
     warping = Warping(**metadata["warping"]) if metadata.get("warping") else None

@@ -1,4 +1,4 @@
-"""Models that look at pairs of encoded scans, in a stream of whole scans."""
+"""Runs models of pairs of encoded scans on a stream of whole scans."""
 
 import math
 from collections.abc import Iterable
@@ -18,71 +18,72 @@ if TYPE_CHECKING:
     from rcnn_odom.models.warping import WarpingStepper
 
 LONGEST_HOLD = 10
-"""Periods over which the last motion goes on; for longer it is not known to."""
+"""Periods for which the last motion is assumed to go on; after that the pose stands still."""
 SAME_SPACING = 0.2
-"""Part by which the spacing of a laser's returns may differ between scans."""
+"""Relative difference in the spacing of returns up to which two scans have the same spacing."""
 OTHER_LASER = "other laser"
-"""Kind of trouble."""
+"""Kind of fault, with which the note begins."""
 
 
 def as_used(network: Stepper) -> Stepper:
-    """What steps through encoded scans: a network itself, or what predicts and warps for it."""
-    return _predicting(network) or network
+    """The stepper of a network in a stream: for residual motions a ``WarpingStepper``, else the network."""
+    return _find_warping_stepper(network) or network
 
 
-def _predicting(network: Stepper) -> "WarpingStepper | None":
-    """What predicts and warps for a network that measures residual motions; None for other networks."""
+def _find_warping_stepper(network: Stepper) -> "WarpingStepper | None":
+    """The stepper that predicts and warps for a network of residual motions; None for other networks."""
     if network.description.warping is None:
         return None
-    from rcnn_odom.models.warping import WarpingStepper  # compiled code, which other networks do not need
+    from rcnn_odom.models.warping import WarpingStepper  # compiles code, which other networks do not need
 
     return network if isinstance(network, WarpingStepper) else WarpingStepper(cast(Network, network))
 
 
 class PairTracker:
-    """A :class:`rcnn_odom.models.streaming.ScanTracker` of a model of pairs of depth vectors.
+    """A :class:`rcnn_odom.models.streaming.ScanTracker` for a model of pairs of depth vectors.
 
-    Whatever happens leaves the model's state as it was, and a step suffers from:
+    Notes are of these kinds; unless stated otherwise, the model's state does not change:
 
     - *no returns*: the last motion goes on, as over a gap.
-    - *gap*, where scans were dropped or had no returns, so that more than one period has passed: the last
-      motion goes on over it, for ``LONGEST_HOLD`` periods at most. Networks do not know such long steps;
-      comparing the scans at both ends all the same is several times worse (docs/deployment.md). A network
-      that measures residual motions compares them from where the motion leads, across as many periods.
-    - *other laser*, beams that do not lie where the sensor has them, or readings that cannot be metres (see
-      :mod:`rcnn_odom.recordings.beams`): not used, the last motion goes on.
-    - *beam count*, other than before: the scan is encoded into the same bins as any other.
-    - *few returns*: less than half as many bins have one as in nearly all (95 %) of the validation scans; the
-      estimate stands.
-    - *no estimate*: the network gave nan or inf; the last motion goes on, and its state starts anew.
+    - *gap*: more than one period has passed since the last scan with returns. The last motion goes on over
+      the gap, for at most ``LONGEST_HOLD`` periods. Networks are not trained on such long steps, and
+      comparing the scans at both ends of the gap is several times less accurate (docs/deployment.md). A
+      network that measures residual motions does compare them, up to ``LONGEST_HOLD`` periods.
+    - *other laser*: the beams do not match those of the sensor, or the ranges cannot be in metres (see
+      :mod:`rcnn_odom.recordings.beams`). The scan is not used; the last motion goes on.
+    - *beam count*: it has changed; the scan is encoded into the same bins as any other, and used.
+    - *few returns*: less than half as many bins with a return as in 95 % of the validation scans; the
+      estimate is used.
+    - *no estimate*: the network gave nan or inf; the last motion goes on, and the model is reset.
 
     Args:
-        stepper: the model, at its start.
+        stepper: the model, without earlier scans.
 
     Attributes:
-        description: of the model.
+        description: that of the model.
         period: seconds between scans in its training.
-        beam_check: compares the scans' beams with those that it knows.
+        beam_check: compares the beams of scans with the sensor and with earlier scans.
     """
 
     def __init__(self, stepper: Stepper) -> None:
-        self._predicting = _predicting(stepper)
-        self._stepper = self._predicting or stepper
+        self._warping_stepper = _find_warping_stepper(stepper)
+        self._stepper = self._warping_stepper or stepper
         self.description, self.period = stepper.description, stepper.description.period
         self._forget()
 
     def reset(self) -> None:
-        """Forgets everything: the next scan is the first of another laser or of another place of it."""
+        """Forgets everything: the next scan is the first one, or the laser or its mounting has changed."""
         self._stepper.reset()
         self._forget()
 
     def _forget(self) -> None:
         self._earlier: npt.NDArray[np.float32] | None = None  # the last scan with returns
         self._present: npt.NDArray[np.float32] | None = None  # the last scan
-        self._motion, self._held, self._missed = np.zeros(3), 0, 0
-        self._open = np.zeros((3, 3))  # of the last step's error, what the next estimate would take back
+        self._motion = np.zeros(3)  # the last estimated step over one period
+        self._held, self._missed = 0, 0  # periods without an estimate, and without returns
+        self._taken_back = np.zeros((3, 3))  # the part of the last step's error that the next step cancels
         self._beams, self._spacing = 0, 0.0
-        # Surfaces are drawn alike whatever the beams: they may be fewer than the sensor's, on a part of it.
+        # Rendering does not need the sensor's beams: there may be fewer, or they may cover only a part of it.
         self.beam_check = BeamCheck(self.description.sensor, partly=self.description.warping is not None)
 
     @property
@@ -97,47 +98,47 @@ class PairTracker:
         return decode(self._present, self.description.sensor)
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes a scan that is not compared with those before; what it suffers from."""
+        """Takes a scan that is not compared with those before; returns notes."""
         notes: list[str] = []
         depth = self._encode(scan, notes)
         self._earlier, self._missed = (depth if depth.any() else None), 0
         return tuple(notes)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
-        """The step to one more scan, ``periods`` after the last one; see the class."""
-        assert self._earlier is not None, "there is a scan to compare with; begin comes first"
+        """The step to one more scan, ``periods`` after the last one; the class lists the notes."""
+        assert self._earlier is not None, "call begin first, until has_seen"
         notes: list[str] = []
         depth = self._encode(scan, notes)
         if not depth.any():
             self._missed += periods
-            return self._go_on(periods, notes)
+            return self._predict(periods, notes)
         pair, self._earlier = np.stack([self._earlier, depth]), depth
         gap, self._missed = periods + self._missed, 0
-        is_across = self._predicting is not None and gap <= LONGEST_HOLD
+        is_compared = self._warping_stepper is not None and gap <= LONGEST_HOLD
         if gap > 1:
-            how = "compared across it" if is_across else "the last motion goes on"
-            notes.append(f"gap: {gap} periods after the last scan, {how}")
-            if not is_across:
+            action = "compared across it" if is_compared else "the last motion goes on"
+            notes.append(f"gap: {gap} periods after the last scan, {action}")
+            if not is_compared:
                 return self._hold(periods, notes)
-        step = self._predicting(pair, periods) if self._predicting else self._stepper(pair)
+        step = self._warping_stepper(pair, periods) if self._warping_stepper else self._stepper(pair)
         if not np.isfinite(step.array()).all():
             self._stepper.reset()  # its state is nan as well
             return self._hold(periods, [*notes, "no estimate: the last motion goes on"])
         if periods == 1:
             self._motion = step.array()
-        self._held, self._open = 0, step.taken_back
+        self._held, self._taken_back = 0, step.taken_back
         return Registered(step, tuple(notes))
 
-    def _go_on(self, periods: int, notes: list[str]) -> Registered:
-        """The step to a scan without returns."""
-        if self._predicting is None or self._held + periods > LONGEST_HOLD:
+    def _predict(self, periods: int, notes: list[str]) -> Registered:
+        """The step to a scan without returns, which networks of residual motions predict themselves."""
+        if self._warping_stepper is None or self._held + periods > LONGEST_HOLD:
             return self._hold(periods, notes)
-        step = self._predicting.predict(periods)
-        self._held, self._open = self._held + periods, step.taken_back
+        step = self._warping_stepper.predict(periods)
+        self._held, self._taken_back = self._held + periods, step.taken_back
         return Registered(step, tuple(notes), is_estimated=False)
 
     def _encode(self, scan: Scan, notes: list[str]) -> npt.NDArray[np.float32]:
-        """A depth vector (bins,), empty where the scan does not fit; adds what is unusual to ``notes``."""
+        """The depth vector (bins,) of a scan, all 0 if the laser does not fit; appends to ``notes``."""
         sensor = self.description.sensor
         if misfit := self.beam_check(scan):
             notes.append(f"{OTHER_LASER}: {misfit}")
@@ -154,10 +155,10 @@ class PairTracker:
         return depth
 
     def _compare_beams(self, scan: Scan) -> list[str]:
-        """Words about another number of beams than before, if there is one.
+        """The note on a number of beams that has changed; empty if it has not.
 
-        Where bearings are given, only another spacing counts, that of most neighbours: they may be those of
-        the returns alone, whose number changes.
+        If the scan has bearings, the median spacing of neighbours must have changed as well, because the
+        bearings may be those of the returns only, whose number varies.
         """
         before, last, count = self._beams, self._spacing, len(scan.ranges)
         if not scan.has_all_beams or count == before or count < 2:
@@ -168,27 +169,35 @@ class PairTracker:
         return [] if same else [f"beam count: {count} after {before}"]
 
     def _hold(self, periods: int, notes: list[str]) -> Registered:
-        """The last motion goes on, over ``LONGEST_HOLD`` periods in all at most."""
+        """Repeats the last motion, for at most ``LONGEST_HOLD`` periods in a row."""
         moving = min(periods, LONGEST_HOLD - self._held)
         self._held += moving
         held = np.zeros(3)
         for _ in range(moving):
             held = advance(held, self._motion)
         typical = periods * np.array(self.description.typical_step)
-        # What is unknown of one is unknown of its covariances with the others.
+        # The product makes covariances with a component nan whose variance is unknown.
         covariance = np.diag(np.square(typical)) + 0 * np.outer(typical, typical)
         x, y, heading = held.tolist()
-        # It takes nothing back of the last step's error, which whoever adds up covariances takes off.
-        stays = relative_covariance(Step(x, y, heading), 2 * self._open, np.zeros((3, 3)))
-        self._open = np.zeros((3, 3))
-        return Registered(Step(x, y, heading, covariance + stays), tuple(notes), is_estimated=False)
+        # This step does not cancel any error of the last step, but the accumulation of covariances assumes
+        # that it does. Therefore that part is added here.
+        compensation = relative_covariance(Step(x, y, heading), 2 * self._taken_back, np.zeros((3, 3)))
+        self._taken_back = np.zeros((3, 3))
+        return Registered(Step(x, y, heading, covariance + compensation), tuple(notes), is_estimated=False)
 
 
 def estimate_pairs(stepper: Stepper, pairs: Iterable[npt.NDArray[np.float32]]) -> Steps:
-    """The steps of a row of pairs of encoded scans (2, bins), of which each begins where the last one ends.
+    """The steps of consecutive pairs of encoded scans.
 
-    Where one that draws its scans does not know the place (nan), the last motion goes on with an unknown
-    covariance; it has begun again by itself.
+    If a network that measures residual motions fails (nan), the last motion goes on with an unknown
+    covariance; its stepper has reset itself.
+
+    Args:
+        stepper: the model, without earlier scans.
+        pairs: (2, bins) metres each, of which the first scan is the second scan of the pair before.
+
+    Returns:
+        One step for each pair.
     """
     steps: list[Step] = []
     for pair in pairs:

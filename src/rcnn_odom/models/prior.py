@@ -1,4 +1,4 @@
-"""What is known of a step before its scan is matched: the last motion, wheels, or a network."""
+"""Priors of a step before its scan is matched: from the last motion, the wheels, or a network."""
 
 import math
 from dataclasses import dataclass, replace
@@ -10,24 +10,28 @@ from rcnn_odom.geometry import FloatArray, relative_step
 from rcnn_odom.recordings.scan import Scan
 
 WHEELS_DISTANCE, WHEELS_TURN = 0.01, 0.01
-"""Metres and radians by which wheel odometry is off, and beside them ``SLIP`` of itself."""
+"""Metres and radians; constant part of the standard deviation of a step of wheel odometry."""
 SLIP = 0.1
+"""The part of that standard deviation that grows with the step, as a fraction of the step."""
 LAST_MOTION = "the last motion goes on"
-"""What becomes of a step, or of a direction of it, that the scan does not determine; in words for notes."""
+"""What happens where the scan does not determine the motion; notes on the scan contain this."""
+WHEELS_STEP = "the step of the wheels is used"
+"""The same if there is wheel odometry."""
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """A step that is expected.
+    """An expected step.
 
     Attributes:
-        step: (3,) x and y in metres and heading in radians from the scan before. A match begins there, and
-            where the scan determines nothing it stands.
-        covariance: (3, 3) of it, in the frame of the scan before; finite.
-        pull: (3, 3) the part of that which was measured, and pulls at the match by its weight beside the
-            match's own; None: the step is only where the match begins.
-        stands: what is told where the step stands in place of a match.
-        comes_from_scan: the step was estimated from this scan, so that it is one where nothing matches.
+        step: (3,) x and y in metres and heading in radians, in the frame of the scan before. It is the
+            initial guess of the match, and is used in directions that the scan does not determine.
+        covariance: (3, 3) of the step, in the frame of the scan before; finite.
+        pull: (3, 3) covariance of the measurement that the step contains. The match is a weighted mean of
+            this measurement and the scan. None: the step is only the initial guess.
+        stands: text of the note if the step is used in place of a match.
+        comes_from_scan: whether the step was estimated from this scan, so that it also counts as an estimate
+            if the scan does not match.
     """
 
     step: FloatArray
@@ -38,50 +42,61 @@ class Prior:
 
 
 class PriorSource(Protocol):
-    """Where a matcher's priors come from; it sees every scan that the matcher sees, in their order."""
+    """A source of a matcher's priors; it receives every scan that the matcher receives, in their order."""
 
     def reset(self) -> None:
         """Forgets everything."""
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes a scan that is not compared with those before; notes on it."""
+        """Takes a scan that is not compared with those before; returns notes."""
 
     @property
     def has_seen(self) -> bool:
-        """Whether it can tell of the next scan although the matcher has seen nothing yet."""
+        """Whether the source can give a prior for the next scan although the matcher has no map yet."""
 
     def expect(
-        self, scan: Scan, periods: int, seconds: float | None, held: Prior
+        self, scan: Scan, periods: int, seconds: float | None, last_motion: Prior
     ) -> tuple[Prior, tuple[str, ...]]:
         """The prior of the step to one more scan, and notes on it.
 
         Args:
-            scan: the next one.
-            periods, seconds: since the last one, as of :class:`rcnn_odom.models.streaming.ScanTracker`.
-            held: that of the matcher's last motion; the answer where the source knows nothing better.
+            scan: the next scan.
+            periods, seconds: since the last scan, as in :class:`rcnn_odom.models.streaming.ScanTracker`.
+            last_motion: the prior from the matcher's last motion, which is returned if there is no better.
         """
 
     def compare(self, step: FloatArray, is_determined: bool) -> None:
-        """Learns of the match that followed.
+        """Takes the result of the match, with which the source can compare its prior.
 
         Args:
-            step: (3,) that the matcher gives.
-            is_determined: by the scan, in all directions.
+            step: (3,) of the match.
+            is_determined: whether the scan determines the step in all directions.
         """
 
 
 def believed(step: FloatArray, distance: float, turn: float, part: float) -> FloatArray:
-    """The covariance (3, 3) of a step that is off by so many metres and radians, and by a part of itself."""
+    """The covariance (3, 3) of a guessed step, from the assumed size of its errors.
+
+    Args:
+        step: (3,) in metres and radians.
+        distance, turn: constant parts of the standard deviations, in metres and radians.
+        part: fraction of the step's length and turn that is added to them.
+
+    Example:
+        >>> believed(np.array([1.0, 0.0, 0.0]), distance=0.1, turn=0.1, part=0.4).diagonal().round(4).tolist()
+        [0.25, 0.25, 0.01]
+    """
     x, y, heading = step.tolist()
-    away, turned = distance + part * math.hypot(x, y), turn + part * abs(heading)
-    return np.diag([away**2, away**2, turned**2])
+    length_deviation, turn_deviation = distance + part * math.hypot(x, y), turn + part * abs(heading)
+    return np.diag([length_deviation**2, length_deviation**2, turn_deviation**2])
 
 
 class LastMotion:
-    """The matcher's last motion goes on, as it is.
+    """Uses the matcher's last motion as the prior.
 
     Args:
-        is_measured: it pulls by its covariance, as if it were measured; others have to be better.
+        is_measured: whether the last motion counts as a measurement with its covariance. This is the baseline
+            for priors from networks.
     """
 
     has_seen = False
@@ -97,17 +112,29 @@ class LastMotion:
         return ()
 
     def expect(
-        self, scan: Scan, periods: int, seconds: float | None, held: Prior
+        self, scan: Scan, periods: int, seconds: float | None, last_motion: Prior
     ) -> tuple[Prior, tuple[str, ...]]:
         """The last motion."""
-        return (replace(held, pull=held.covariance) if self._is_measured else held), ()
+        return (replace(last_motion, pull=last_motion.covariance) if self._is_measured else last_motion), ()
 
     def compare(self, step: FloatArray, is_determined: bool) -> None:
-        """There is nothing to learn."""
+        """There is nothing to compare."""
 
 
 class Wheels:
-    """The robot's own odometry, where scans have it."""
+    """Uses the robot's own odometry as the prior, for scans that have it.
+
+    Example:
+        The wheels have driven 1 m ahead:
+
+        >>> wheels, last_motion = Wheels(), Prior(np.zeros(3), np.eye(3))
+        >>> wheels.begin(Scan(np.ones(3), wheel_pose=(0.0, 0.0, 0.0)))
+        ()
+        >>> scan = Scan(np.ones(3), wheel_pose=(1.0, 0.0, 0.0))
+        >>> prior, notes = wheels.expect(scan, 1, None, last_motion)
+        >>> prior.step.tolist()
+        [1.0, 0.0, 0.0]
+    """
 
     has_seen = False
 
@@ -115,24 +142,24 @@ class Wheels:
         self.reset()
 
     def reset(self) -> None:
-        """Forgets where the wheels were."""
+        """Forgets the last pose of the wheels."""
         self._pose: tuple[float, float, float] | None = None
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes where the wheels are."""
+        """Stores the pose of the wheels."""
         self._pose = scan.wheel_pose
         return ()
 
     def expect(
-        self, scan: Scan, periods: int, seconds: float | None, held: Prior
+        self, scan: Scan, periods: int, seconds: float | None, last_motion: Prior
     ) -> tuple[Prior, tuple[str, ...]]:
-        """The step of the wheels, or the last motion where a scan has none."""
+        """The step of the wheels, or the last motion if one of the two scans has no pose of the wheels."""
         before, self._pose = self._pose, scan.wheel_pose
         if before is None or scan.wheel_pose is None:
-            return held, ()
+            return last_motion, ()
         step = relative_step(np.array(before), np.array(scan.wheel_pose))
         spread = believed(step, WHEELS_DISTANCE, WHEELS_TURN, SLIP)
-        return Prior(step, spread, spread, "the wheels tell it"), ()
+        return Prior(step, spread, spread, WHEELS_STEP), ()
 
     def compare(self, step: FloatArray, is_determined: bool) -> None:
-        """There is nothing to learn."""
+        """There is nothing to compare."""

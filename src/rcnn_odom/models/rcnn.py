@@ -1,4 +1,4 @@
-"""The recurrent networks of the paper: a pre-trained CNN, then an LSTM (paper III-C2, fig. 2)."""
+"""The recurrent networks of the paper: a pre-trained CNN followed by an LSTM (paper III-C2, fig. 2)."""
 
 import logging
 import math
@@ -28,14 +28,14 @@ log = logging.getLogger(__name__)
 
 @dataclass(kw_only=True)
 class FirstStageOptions(CNNOptions):
-    """Of the classifying CNN that is trained first."""
+    """Options of the classification CNN that is trained first."""
 
     variant: str = option(choices=(CNNClassification.name,))
 
 
 @dataclass(kw_only=True)
 class RCNNOptions(CNNOptions):
-    """What ``conf/model`` sets beside the CNN's options."""
+    """The options of ``conf/model/rcnn_reg.yaml`` and ``rcnn_cls.yaml``, whose comments explain them."""
 
     hidden_size: int = option(above=0)
     layers: int = option(above=0)
@@ -45,10 +45,21 @@ class RCNNOptions(CNNOptions):
 
 
 class LSTM(nn.Module):
-    """Stacked LSTM layers written out: one product for the inputs of all steps, then the recurrence.
+    """Stacked LSTM layers: one matrix product for the inputs of all steps, then the recurrence.
 
-    Equal to ``torch.nn.LSTM`` (batch first), whose CPU kernel repacks the weights at every call; but
-    dropout falls on the outputs of the last layer as well.
+    The results equal those of ``torch.nn.LSTM`` (batch first), whose CPU kernel is slower because it repacks
+    the weights at every call. Unlike there, dropout also applies to the outputs of the last layer.
+
+    Args:
+        inputs: width of the input.
+        hidden: width of each layer.
+        layers: number of layers.
+        dropout: probability that an output is set to zero in training.
+
+    Example:
+        >>> outputs, (h, c) = LSTM(inputs=3, hidden=4, layers=2)(torch.zeros(1, 5, 3))
+        >>> tuple(outputs.shape), tuple(h.shape)
+        ((1, 5, 4), (2, 1, 4))
     """
 
     def __init__(self, inputs: int, hidden: int, layers: int, dropout: float = 0.0) -> None:
@@ -67,8 +78,8 @@ class LSTM(nn.Module):
 
         Args:
             inputs: (B, T, width).
-            state: hidden and cell state, each (layers, B, hidden), as returned for the steps before; empty:
-                zeros.
+            state: hidden and cell state, each (layers, B, hidden), as returned for the steps before; if
+                empty, zeros are used.
         """
         if not state:
             zeros = inputs.new_zeros(len(self.weight_ih), len(inputs), self.hidden, dtype=torch.float32)
@@ -76,7 +87,7 @@ class LSTM(nn.Module):
         after = []
         for layer, (h, c) in enumerate(zip(*state, strict=True)):
             bias = self.bias_ih[layer] + self.bias_hh[layer]
-            # Time first: each step's gates are then one contiguous block.
+            # Time is the first dimension, so that each step's gates are one contiguous block.
             gates_in = F.linear(inputs.transpose(0, 1), self.weight_ih[layer], bias)
             outputs = []
             for step in gates_in.unbind(0):
@@ -95,10 +106,12 @@ class LSTM(nn.Module):
 
 
 class FirstStage(nn.Module):
-    """The encoder of the CNN that is trained first, and its head.
+    """The encoder and the head of the CNN that is trained first.
 
     Args:
-        options: of the recurrent network. sensor: its laser. classes: of the rotation.
+        options: those of the recurrent network.
+        sensor: defines the depth vectors.
+        classes: classes of the rotation.
     """
 
     def __init__(self, options: dict[str, Any], sensor: Sensor, classes: RotationClasses) -> None:
@@ -106,15 +119,15 @@ class FirstStage(nn.Module):
         self.encoder = Encoder(sensor, options["kernel_size"], options["pooling"])
         self.head = MotionHead(self.encoder.features, classes, options["angle"])
         self.requires_grad_(not options["freeze"])
-        # The largest score has no gradient, and several processes cannot train a weight that gets none.
+        # argmax has no gradient, and training on several processes fails for weights without a gradient.
         self.head.rotation.requires_grad_(not (options["freeze"] or self.head.argmax))
 
 
 class RecurrentModel(TwoNumberModel):
-    """The first stage's features and own estimates go through an LSTM.
+    """The first stage, whose features and estimates are the input of an LSTM, and a head.
 
-    With ``projection`` so many linear combinations of the features take their place, which is an input matrix
-    of that rank. Dropout hides a part of each LSTM layer's outputs from what follows.
+    With the option ``projection``, the features are replaced by that number of linear combinations, which
+    limits the rank of the LSTM's input matrix. Dropout applies to the outputs of each LSTM layer.
     """
 
     Options = RCNNOptions
@@ -128,14 +141,15 @@ class RecurrentModel(TwoNumberModel):
         self.projection = nn.Linear(features, width) if width else nn.Identity()
         hidden = options["hidden_size"]
         self.lstm = LSTM((width or features) + 2, hidden, options["layers"], options["dropout"])
-        # Drawn as if the two estimates were all the input: as two among thousands of features they would
-        # hardly be heard, and the LSTM would have to find out again what the first stage knows.
+        # Larger initial weights for the first stage's two estimates, as if they were the only input.
+        # Otherwise thousands of features would outweigh them, and the LSTM would have to learn the motion
+        # again.
         with torch.no_grad():
             self.lstm.weight_ih[0][:, -2:].uniform_(-(2**-0.5), 2**-0.5)
         self.head = MotionHead(hidden, self.classes if self.classifies else None, options["angle"])
 
     def motions(self, pairs: Tensor, state: State = ()) -> tuple[Estimate, State]:
-        """Motions of T consecutive pairs (B, T, 2, bins) in metres, and the LSTM's state after them."""
+        """Motions (B, T, 2) of consecutive pairs (B, T, 2, bins) in metres, and the LSTM's new state."""
         features = self.cnn.encoder(pairs)
         first_stage = self.cnn.head(features).motion
         first = self.cnn.head.standardise(first_stage)
@@ -144,38 +158,38 @@ class RecurrentModel(TwoNumberModel):
         return self.head(outputs)._replace(first_stage=first_stage), state
 
     def initial_state(self) -> dict[str, Tensor]:
-        """Of the LSTM."""
+        """The LSTM's state before the first pair."""
         return self.lstm.initial_state()
 
     def take_first_stage(self, model: TrainedModel) -> None:
-        """Takes encoder and head of a trained CNN.
+        """Copies the weights of encoder and head from a trained CNN.
 
         Raises:
-            InputError: its network is another one.
+            InputError: an option of its network differs from that of this model.
         """
         assert isinstance(model, CNNClassification)
         for key in ("kernel_size", "pooling", "rotation_classes"):
             if model.options[key] != self.options[key]:
                 raise InputError(
                     f"trained with {key}={model.options[key]}, but model.{key} is {self.options[key]}; "
-                    "set it as in that training, or leave model.pretrained out"
+                    f"set model.{key} as in that training, or do not set model.pretrained"
                 )
         self.cnn.encoder.load_state_dict(model.encoder.state_dict())
         self.cnn.head.load_state_dict(model.head.state_dict())
         if self.cnn.head.argmax and not self.options["freeze"]:
             log.info(
-                "model.angle=argmax: the first stage's class scores are not trained any further, since the "
-                "largest of them has no gradient"
+                "model.angle=argmax: the layer of the first stage that gives the class scores is not trained "
+                "any further, because argmax has no gradient"
             )
 
 
 class RCNNRegression(RecurrentModel):
-    """Eq. 3 after the LSTM: the paper's best."""
+    """Regression after the LSTM, with the loss of eq. 3; the paper's best network."""
 
     name, classifies = "rcnn_reg", False
 
 
 class RCNNClassification(RecurrentModel):
-    """Eq. 4 after the LSTM."""
+    """Classification of the rotation after the LSTM, with the loss of eq. 4."""
 
     name, classifies = "rcnn_cls", True

@@ -1,23 +1,35 @@
-"""Where the networks that ship with the project are, for models and for robots alike."""
+"""Finds the files of the networks that ship with the project."""
 
 from pathlib import Path
 
 from rcnn_odom.errors import InputError
 
 FOLDER = Path(__file__).parents[1] / "deployment" / "shipped"
-"""Files beside their model cards; see :mod:`rcnn_odom.deployment.shipped`."""
+"""Folder of the files and their model cards; see :mod:`rcnn_odom.deployment.shipped`."""
 
 
 def shipped_models() -> list[str]:
-    """Names of the models."""
+    """Names of the shipped networks.
+
+    Example:
+        >>> "all_round" in shipped_models()
+        True
+    """
     return sorted(path.stem for path in FOLDER.glob("*.onnx"))
 
 
 def find_file(path: str | Path) -> Path:
-    """A file by its path, or a model that ships with the project by its name.
+    """The file of a network.
+
+    Args:
+        path: path of a file, or name of a network that ships with the project.
 
     Raises:
-        InputError: neither is there.
+        InputError: there is neither such a file nor such a network.
+
+    Example:
+        >>> find_file("all_round").name
+        'all_round.onnx'
     """
     if Path(path).is_file():
         return Path(path)

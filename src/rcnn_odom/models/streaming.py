@@ -1,4 +1,4 @@
-"""What a model is in a stream: of pairs of encoded scans, or of whole scans."""
+"""The interfaces of a model in a stream of pairs of encoded scans, or of whole scans."""
 
 import math
 from dataclasses import dataclass, replace
@@ -14,17 +14,16 @@ from rcnn_odom.recordings.scan import Scan
 
 @dataclass(frozen=True)
 class Warping:
-    """How a network that measures residual motions is used.
+    """How a network that measures residual motions is used in a stream.
 
     Attributes:
-        resolution_deg: width of the bins that scans are drawn into; None: that of the sensor.
-        passes: how often each scan is compared at most, each time with the earlier scan seen from the last
-            estimate.
-        settled: metres; a scan is not compared again after a correction of less than that.
-        radians_a_metre: an error of the heading that counts like a metre: one over a usual range in metres.
-        key_distance, key_turn_deg: metres and degrees from the key scan, with which all scans are compared,
-            from which on the present scan takes its place. 0: every scan, so that each is compared with the
-            one before.
+        resolution_deg: width of the bins into which scans are rendered, in degrees; None: that of the sensor.
+        passes: maximum number of comparisons of each scan; each renders the key scan from the last estimate.
+        settled: metres; a scan is not compared again if the last comparison changed its pose by less.
+        radians_a_metre: heading error in radians that counts as much as an error of one metre, i.e. one
+            divided by a typical range in metres.
+        key_distance, key_turn_deg: metres and degrees. Scans are compared with a key scan. A scan that is so
+            far from the key scan becomes the new key scan. With 0, each scan is compared with the one before.
     """
 
     resolution_deg: float | None
@@ -35,28 +34,31 @@ class Warping:
     key_turn_deg: float
 
     def needs_key(self, pose: FloatArray) -> bool:
-        """Whether a pose (3,) in the frame of the key scan is far enough away for a new key."""
+        """Whether a scan with this pose (3,) in the frame of the key scan becomes the new key scan."""
         x, y, heading = pose.tolist()
         is_turned = abs(heading) >= math.radians(self.key_turn_deg)
         return math.hypot(x, y) >= self.key_distance or is_turned
 
     def drawn(self, sensor: Sensor) -> Sensor:
-        """The bins that scans of a sensor are drawn into."""
+        """The sensor with the bins into which its scans are rendered."""
         return replace(sensor, resolution_deg=self.resolution_deg or sensor.resolution_deg)
 
 
 @dataclass(frozen=True)
 class Description:
-    """What an odometer has to know of a model that looks at encoded scans.
+    """The description of a model of encoded scans that an odometer needs.
 
     Attributes:
-        sensor: the laser as the model sees it: how scans are encoded for it.
-        typical_step: root mean square of the training steps' x, y (metres) and heading (radians): how wrong
-            a step may be that is not known at all. nan if unknown.
-        least_filled: share of bins with a return below which a scan counts as sparse; nan if unknown.
-        period: usual seconds between scans in training; nan if unknown.
-        typical_change: root mean square of the change of steps from scan to scan; nan if unknown.
-        warping: how a network that measures residual motions is used; None: it is given pairs as they are.
+        sensor: defines how scans are encoded for the model.
+        typical_step: root mean square of the training steps' x, y (metres) and heading (radians), which is
+            used as the standard deviation of a step without an estimate; nan if unknown.
+        least_filled: fraction of bins with a return; scans with less are noted as *few returns*. nan if
+            unknown.
+        period: median time in seconds between scans in training; nan if unknown.
+        warping: how a network that measures residual motions is used; None for other networks, which get
+            pairs of encoded scans without changes.
+        typical_change: root mean square of the difference between consecutive training steps, in metres,
+            metres and radians; nan if unknown.
     """
 
     sensor: Sensor
@@ -68,12 +70,12 @@ class Description:
 
     @property
     def input_sensor(self) -> Sensor:
-        """The bins of the pairs that the network itself is given."""
+        """The sensor with the bins of the network's input: those of rendered scans if there is a warping."""
         return self.sensor if self.warping is None else self.warping.drawn(self.sensor)
 
 
 class Stepper(Protocol):
-    """A model in a stream of encoded scans: one step after the other; it carries its own state."""
+    """A model in a stream of encoded scans, which estimates one step after the other and keeps its state."""
 
     description: Description
 
@@ -85,21 +87,22 @@ class Stepper(Protocol):
 
 
 class Network(Stepper, Protocol):
-    """What a network with a :class:`Warping` is beside that."""
+    """The additional interface of a network with a :class:`Warping`."""
 
     def forget_last(self) -> None:
-        """Forgets the last pair: the next one is compared in its place."""
+        """Restores the state before the last pair, which the next pair replaces."""
 
 
 @dataclass(frozen=True, eq=False)
 class Registered:
-    """What a model in a stream makes of one more scan.
+    """The result of a model in a stream for one more scan.
 
     Attributes:
-        step: from the scan before. Where nothing could be estimated, the last motion, with a covariance that
-            says how wrong that may be.
-        notes: what the step suffers from, each with its kind before a colon; empty: nothing.
-        is_estimated: the step comes from this scan, at least in part; otherwise the last motion went on.
+        step: the step from the scan before; the last motion, with a larger covariance, if there is no
+            estimate.
+        notes: messages about faults, each with its kind before a colon; empty without a fault.
+        is_estimated: whether the step was estimated from this scan, at least in part; otherwise the last
+            motion goes on.
     """
 
     step: Step
@@ -108,33 +111,33 @@ class Registered:
 
 
 class ScanTracker(Protocol):
-    """A model in a stream of whole scans: it keeps what it needs of those before."""
+    """A model in a stream of whole scans, which keeps its own state."""
 
     period: float
-    """Usual seconds between scans in training; nan: any."""
+    """Usual seconds between scans in training; nan if the model suits any period."""
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
         """The step to one more scan.
 
         Args:
             scan: as the laser gave it.
-            periods: usual times between scans since the last one, more than 1 over a gap.
-            seconds: since the last one; None: unknown.
+            periods: number of usual periods since the last scan, more than 1 over a gap.
+            seconds: time since the last scan; None if unknown.
         """
 
     def begin(self, scan: Scan) -> tuple[str, ...]:
-        """Takes a scan that cannot be compared with those before: the first, or after a clock was set.
+        """Takes a scan that cannot be compared with those before: the first one, or one after a clock jump.
 
         Returns:
             Notes as in :class:`Registered`.
         """
 
     def reset(self) -> None:
-        """Forgets everything: the next scan is the first of another laser or of another place of it."""
+        """Forgets everything: the next scan is the first one, or the laser or its mounting has changed."""
 
     @property
     def has_seen(self) -> bool:
         """Whether there is a scan with returns that the next one can be compared with."""
 
     def returns(self) -> FloatArray:
-        """Points (P, 2) in metres of the last scan in the laser's frame; empty where it was not used."""
+        """Points (P, 2) in metres of the last scan in the laser's frame; empty if it was not used."""

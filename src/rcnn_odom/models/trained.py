@@ -1,4 +1,4 @@
-"""What a model has to say for itself to be trained, exported and run on a robot."""
+"""The interface of a model that can be trained, exported and run on a robot."""
 
 from abc import abstractmethod
 from collections.abc import Iterator, Sequence
@@ -18,29 +18,29 @@ from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
 CHUNK = 64
-"""Pairs that go through a network together when a whole drive is estimated."""
+"""Number of pairs that a network processes together when a whole drive is estimated."""
 
 Batch = dict[str, Tensor]
-"""``pairs`` (B, T, 2, bins) of encoded scans and ``steps`` (B, T, 3), the true ones."""
+"""``pairs`` (B, T, 2, bins) of encoded scans, in metres, and the true ``steps`` (B, T, 3)."""
 State = tuple[Tensor, ...]
-"""What a network carries from pair to pair, in the order of :meth:`TrainedModel.initial_state`."""
+"""The state of a recurrent network between pairs, in the order of :meth:`TrainedModel.initial_state`."""
 
 
 @dataclass(kw_only=True)
 class Recipe:
-    """Options that every training has; ``Options`` of a network begin with them.
+    """Options of every training; the ``Options`` of a network are a subclass.
 
     Attributes:
-        epochs: through the training drives.
-        learning_rate: the top of the one-cycle rate.
-        window: consecutive pairs in a training window.
-        batch_size: windows in a batch.
-        stride: frames between the beginnings of training windows; None: as many as the window has pairs.
-        repeat: how often each window comes in an epoch, each time augmented in another way.
-        pretrained: checkpoint whose weights training begins with, of the same model or of its first stage;
-            None: random weights, and a first stage that is found or trained.
-        averaging: decay of the moving average of the weights over the steps, which is validated and kept in
-            their place; 0: the weights themselves.
+        epochs: number of passes through the training drives.
+        learning_rate: maximum of the one-cycle learning rate.
+        window: number of consecutive pairs in a training window.
+        batch_size: number of windows in a batch.
+        stride: number of scans between the beginnings of training windows; None: as many as ``window``.
+        repeat: how often each window occurs in an epoch, each time with another augmentation.
+        pretrained: checkpoint of the same model or of its first stage, whose weights training begins with;
+            None: random weights, and a first stage that is found among earlier trainings or trained.
+        averaging: decay per step of the moving average of the weights, which is validated and saved instead
+            of the weights themselves; 0: no average.
     """
 
     epochs: int = option(above=0)
@@ -54,29 +54,35 @@ class Recipe:
 
 
 def chunks_of_pairs(scans: Tensor) -> Iterator[Tensor]:
-    """The consecutive pairs of scans (N, bins), (1, T, 2, bins) at a time."""
+    """Yields the consecutive pairs of scans (N, bins) in chunks (1, T, 2, bins) of at most ``CHUNK`` pairs.
+
+    Example:
+        >>> [tuple(pairs.shape) for pairs in chunks_of_pairs(torch.zeros(100, 5))]
+        [(1, 64, 2, 5), (1, 35, 2, 5)]
+    """
     for start in range(0, len(scans) - 1, CHUNK):
         block = scans[start : start + CHUNK + 1]
         yield torch.stack([block[:-1], block[1:]], dim=1)[None]
 
 
 class TrainedModel(nn.Module, Model):
-    """A network.
+    """Base class of all networks.
 
-    A subclass has ``name``, ``Options``, :meth:`forward` and :meth:`loss`; everything else has a default that
-    fits a network without state and without a fitted uncertainty. Weights and buffers are what a checkpoint
-    keeps.
+    A subclass defines ``name``, ``Options``, :meth:`forward` and :meth:`loss`. The defaults of everything
+    else suit a network without state and without a fitted uncertainty. A checkpoint contains the weights and
+    the buffers.
 
     Attributes:
-        first_stage: name of a model that is trained before this one; its options are ``model.first_stage``.
-            None: there is none.
-        only_in_training: options beside the recipe's that do not change what trained weights compute, such as
-            those of the loss: a checkpoint with other values of them can be fine-tuned.
-        typical_step: (3,) root mean square of the training steps, metres and radians; not for
-            :meth:`forward`, since fine-tuning changes it under the same weights.
-        least_filled: share of bins with a return below which a scan is unlike any validation scan; nan
-            before :meth:`calibrate`.
-        period: usual seconds between validation scans; nan before :meth:`calibrate`.
+        first_stage: name of a model that is trained before this one, with the options ``model.first_stage``;
+            None without a first stage.
+        only_in_training: options, in addition to those of :class:`Recipe`, that do not change what trained
+            weights compute, such as those of the loss. A checkpoint can be fine-tuned with other values of
+            them.
+        typical_step: (3,) root mean square of the training steps, in metres and radians. :meth:`forward` must
+            not use it, because fine-tuning changes it for the same weights.
+        least_filled: fraction of bins with a return; scans with fewer returns are unlike all validation
+            scans. nan before :meth:`calibrate`.
+        period: median time in seconds between validation scans; nan before :meth:`calibrate`.
     """
 
     trains: ClassVar[bool] = True
@@ -103,30 +109,35 @@ class TrainedModel(nn.Module, Model):
 
         Returns:
             Steps (B, T, 3) in metres and radians, their covariances (B, T, 3, 3), nan where unknown, and the
-            state after them.
+            state after the last pair.
         """
 
     @abstractmethod
     def loss(self, batch: Batch) -> dict[str, Tensor]:
-        """What training makes small, ``loss``, and beside it scalars that are logged under their names.
+        """The training loss of a batch.
 
-        ``diverged`` (B,), of bool, may tell which windows are to blame for a loss that is not finite; it is
-        not logged.
+        Returns:
+            ``loss``, the scalar that is minimised, and other scalars, which are logged under their names.
+            Optionally ``diverged`` (B,), bool, which marks the windows that cause a loss that is not finite;
+            it is not logged.
         """
 
     def initial_state(self) -> dict[str, Tensor]:
-        """The state before the first pair for B = 1, by the names that it has in an exported file."""
+        """The state before the first pair for B = 1; the keys are its names in an exported file."""
         return {}
 
     def set_units(self, steps: FloatArray) -> None:
-        """Told the training drives' steps (N, 3) before training, for the scales of inputs and outputs."""
+        """Sets the scales of inputs and outputs from the steps (N, 3) of the training drives.
+
+        It is called once before training.
+        """
         self.typical_step.copy_(torch.from_numpy(np.sqrt(np.square(steps).mean(0))))
 
     def take_weights(self, model: "TrainedModel") -> None:
-        """Takes the weights of a trained network with the same options, to train them further.
+        """Copies the weights of a trained network with the same options, for fine-tuning.
 
-        The scales that :meth:`set_units` had given that network come with its weights, which mean nothing in
-        others; ``typical_step`` stays that of the new training drives.
+        The scales of :meth:`set_units` are copied as well, because the weights are only valid with them. Only
+        ``typical_step`` remains that of the new training drives.
 
         Raises:
             RuntimeError: the weights have other shapes or names.
@@ -136,20 +147,17 @@ class TrainedModel(nn.Module, Model):
         self.typical_step.copy_(typical_step)
 
     def take_first_stage(self, model: "TrainedModel") -> None:
-        """Takes what it needs of its trained first stage.
+        """Copies weights from a trained first stage.
 
         Raises:
-            InputError: that was trained with other options than this model needs.
+            InputError: the options of the first stage do not suit this model.
         """
         raise NotImplementedError
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
-        """Fits what is known of validation drives: how full and how frequent scans are.
-
-        A subclass fits its covariances here too.
-        """
+        """Fits ``least_filled`` and ``period`` to validation drives; a subclass also fits its covariances."""
         filled = np.concatenate([(np.array(drive.scans) > 0).mean(1) for drive in drives])
-        # Half of the fifth percentile: one empty scan must not switch the note on few returns off.
+        # A percentile, because with the minimum, one empty scan would disable the note on few returns.
         self.least_filled.fill_(0.5 * float(np.quantile(filled, 0.05)))
         period = float(np.median(np.concatenate([np.diff(drive.stamps) for drive in drives])))
         self.period.fill_(period if period > 0 else torch.nan)
@@ -166,9 +174,9 @@ class TrainedModel(nn.Module, Model):
 
     @torch.no_grad()
     def estimate_scans(self, scans: Tensor) -> Steps:
-        """The steps of encoded scans (N, bins), the state carried throughout.
+        """The steps of encoded scans (N, bins); the state is carried through the whole drive.
 
-        In full precision whatever the training's, so that a checkpoint gives the same numbers everywhere.
+        The computation is in full precision, so that a checkpoint gives the same results everywhere.
         """
         state: State = ()
         values: list[FloatArray] = []
@@ -181,17 +189,21 @@ class TrainedModel(nn.Module, Model):
         return Steps(np.concatenate(values), np.concatenate(covariances))
 
     def describe(self) -> Description:
-        """What an odometer has to know."""
+        """The description of the network that an odometer needs."""
         x, y, heading = self.typical_step.double().tolist()
         return Description(self.sensor, (x, y, heading), float(self.least_filled), float(self.period))
 
     def stepper(self) -> Stepper:
-        """One pair after the other, computed by PyTorch; robots run the exported file, which is faster."""
+        """The network in a stream, computed by PyTorch; robots use the exported file, which is faster."""
         return as_used(TorchStepper(self))
 
 
 class TorchStepper:
-    """A network that is called as it is: the reference that an exported file is compared with."""
+    """Runs a network on one pair after the other with PyTorch; exported files are compared with it.
+
+    Args:
+        model: the network.
+    """
 
     def __init__(self, model: TrainedModel) -> None:
         self.model, self.description = model.eval(), model.describe()
@@ -203,7 +215,7 @@ class TorchStepper:
         self._before: State = ()
 
     def forget_last(self) -> None:
-        """Forgets the last pair: the next one is compared in its place."""
+        """Restores the state before the last pair, which the next pair replaces."""
         self._state = self._before
 
     @torch.no_grad()

@@ -1,6 +1,6 @@
-"""Predict, warp, correct: how a network that measures what is left of a motion is used in a stream.
+"""Predict, warp, correct: the use of a network that measures residual motions in a stream of scans.
 
-Needs numpy and numba alone. The network itself is :mod:`rcnn_odom.models.cnn_warp`.
+This module needs only numpy and numba. The network itself is in :mod:`rcnn_odom.models.cnn_warp`.
 """
 
 import math
@@ -13,21 +13,28 @@ from rcnn_odom.models.motion_filter import MotionFilter
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
-LOST = 0.5
-"""Metres: after a larger correction nothing of the prediction is kept. Where the last of several still is
-that large, the network does not know the place."""
+LARGEST_CORRECTION = 0.5
+"""Metres; after a larger correction, the measurement is used alone, without the prediction.
+
+If the last of several corrections is still larger, the network has failed and there is no estimate.
+"""
 
 
 class WarpingStepper:
-    """A :class:`rcnn_odom.models.streaming.Stepper` out of a network that measures residual motions.
+    """Makes a :class:`rcnn_odom.models.streaming.Stepper` from a network that measures residual motions.
 
-    The motion is predicted to go on; the key scan is seen from where it leads (:func:`~.reprojection.render`)
-    and compared with the present scan; the network says what is left, which corrects the prediction as far as
-    it is known better than that (:class:`~.motion_filter.MotionFilter`).
+    The pose of the new scan is predicted from the last motion. The key scan is rendered from the predicted
+    pose (:func:`~.reprojection.render`), and the network compares it with the new scan. A Kalman filter
+    corrects the prediction by the measured residual motion (:class:`~.motion_filter.MotionFilter`).
 
     Args:
-        network: measures where the later of two drawn scans (2, bins drawn) was taken, seen from where the
-            earlier one seems to have been taken; its description says how it is used.
+        network: measures the residual motion of two rendered scans (2, rendered bins): the pose of the later
+            scan relative to the viewpoint of the earlier one. Its description has a ``warping``.
+
+    Attributes:
+        network: as given.
+        description: that of the network.
+        warping: that of the description.
     """
 
     def __init__(self, network: Network) -> None:
@@ -49,22 +56,21 @@ class WarpingStepper:
         self._pose: FloatArray = np.zeros(3)
 
     def __call__(self, pair: npt.NDArray[np.float32], periods: int = 1) -> Step:
-        """The step between two encoded scans (2, bins), the earlier first.
+        """The step between two encoded scans; nan if the network fails, after which the stepper is reset.
 
         Args:
-            pair: the two scans.
-            periods: usual times between scans from the earlier scan, or from where :meth:`predict` has led
-                since, to the later one.
+            pair: (2, bins) metres, the earlier scan first.
+            periods: usual periods between the two scans, without those that :meth:`predict` has covered.
         """
         if self._last is None or not np.array_equal(pair[0], self._last):
-            self._take_key(pair[0])  # the first pair, or scans between were not for the network
+            self._take_key(pair[0])  # this is the first pair, or scans between the pairs were not used
         expected = advance(self._pose, self._filter.displacement(periods))
         measured = self._measure(pair[1], expected, periods)
         if measured is None:
             self.reset()
             return Step(math.nan, math.nan, math.nan)
-        believed, covariance, taken_back = self._filter.correct(*measured, periods)
-        pose = advance(expected, believed)
+        correction, covariance, taken_back = self._filter.correct(*measured, periods)
+        pose = advance(expected, correction)
         x, y, heading = relative_step(self._pose, pose).tolist()
         self._last, self._pose = pair[1].copy(), pose
         if self.warping.needs_key(pose):
@@ -73,14 +79,14 @@ class WarpingStepper:
         return Step(x, y, heading, covariance, taken_back)
 
     def predict(self, periods: int) -> Step:
-        """The step over so many periods to a scan that shows nothing: the motion goes on."""
+        """The step to a scan without returns, ``periods`` later, if the last motion goes on."""
         x, y, heading = self._filter.displacement(periods).tolist()
         covariance, taken_back = self._filter.predict(periods)
         self._pose = advance(self._pose, np.array([x, y, heading]))
         return Step(x, y, heading, covariance, taken_back)
 
     def _take_key(self, scan: npt.NDArray[np.float32]) -> None:
-        """Compares the next scans with this one."""
+        """Makes a scan (bins,) the key scan, with which the next scans are compared."""
         self._key = scan.copy()
         self._pose = np.zeros(3)
         self._filter.take_key()
@@ -88,33 +94,41 @@ class WarpingStepper:
     def _measure(
         self, scan: npt.NDArray[np.float32], expected: FloatArray, periods: int
     ) -> tuple[FloatArray, FloatArray] | None:
-        """Where a scan was taken, seen from where it is expected (3,), and the covariance (3, 3) of that.
+        """Measures the pose of a scan by comparisons with the key scan, from better and better viewpoints.
 
-        None where the network finds no place for it. The expected pose (3,) is told of the key's frame. It is
-        compared again from where it is believed to be, not from where it was measured (an iterated Kalman
-        filter): along a bare wall the place to compare from must not wander off with the measurements.
+        The viewpoint of each comparison is the filtered pose, not the measured one (an iterated Kalman
+        filter). Otherwise it would drift with the measurement errors along a bare wall.
+
+        Args:
+            scan: (bins,) metres.
+            expected: (3,) predicted pose in the frame of the key scan.
+            periods: as in :meth:`__call__`.
+
+        Returns:
+            The measured pose (3,) in the frame of the expected one, and its covariance (3, 3) in the frame of
+            the expected pose; None if the network gives nan or its corrections do not become small.
         """
         now = render(scan, self.description.sensor, np.zeros(3), self._drawn)
-        believed = np.zeros(3)
+        correction = np.zeros(3)
         for number in range(self.warping.passes):
             if number:
-                self.network.forget_last()  # of several passes the last one is the scan's
-            pose = advance(expected, believed)
+                self.network.forget_last()  # the network's state must contain each scan only once
+            pose = advance(expected, correction)
             before = render(self._key, self.description.sensor, pose, self._drawn)
             residual = self.network(np.stack([before, now]))
             if not np.isfinite(residual.array()).all():
                 return None
-            whole = relative_step(expected, advance(pose, residual.array()))
-            covariance = turn_covariance(residual.covariance, float(whole[2]) - residual.heading)
-            last, is_far_off = believed, self._size(residual.array()) > LOST
-            believed = whole if is_far_off else self._filter.weigh(whole, covariance, periods)
-            if self._size(believed - last) < self.warping.settled:
+            measured = relative_step(expected, advance(pose, residual.array()))
+            covariance = turn_covariance(residual.covariance, float(measured[2]) - residual.heading)
+            last, is_far_off = correction, self._size(residual.array()) > LARGEST_CORRECTION
+            correction = measured if is_far_off else self._filter.weigh(measured, covariance, periods)
+            if self._size(correction - last) < self.warping.settled:
                 break
         if number and is_far_off:
-            return None  # it jumps about
-        return whole, covariance
+            return None  # the corrections do not converge
+        return measured, covariance
 
     def _size(self, motion: FloatArray) -> float:
-        """Of a motion (3,) in metres, its turn by ``radians_a_metre``."""
+        """Length of a motion (3,) in metres, in which ``radians_a_metre`` of its turn count as one metre."""
         x, y, heading = motion.tolist()
         return math.hypot(x, y, heading / self.warping.radians_a_metre)

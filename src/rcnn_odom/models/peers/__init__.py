@@ -1,1 +1,1 @@
-"""Published matchers of other projects behind this project's contract, to be measured beside ours."""
+"""Published matchers of other projects with this project's interface, for comparison with ours."""

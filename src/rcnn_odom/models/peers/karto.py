@@ -1,4 +1,4 @@
-"""Karto's scan matcher, that of slam_toolbox: correlation with a grid of the last scans.
+"""Karto's scan matcher, which slam_toolbox uses: correlation with a grid of the last scans.
 
 Konolige, Grisetti, Kuemmerle, Burgard, Limketkai and Vincent, "Efficient Sparse Pose Adjustment for 2D
 Mapping", IROS 2010.
@@ -16,32 +16,32 @@ from rcnn_odom.models.peers.peer import Peer
 from rcnn_odom.recordings.scan import Scan
 
 LAST_SCANS = 10
-"""That make up the grid: as many as slam_toolbox keeps for its matcher."""
+"""Number of last scans that make up the grid, the same as in slam_toolbox."""
 SEARCH_IN_CELLS, SMEAR_IN_CELLS = 30.0, 3.0
-"""Side of the square that is searched, and the smear of a point, in cells: as in its own defaults, 0.3 m and
-0.03 m of 0.01 m."""
+"""Side of the searched square, and the standard deviation by which points are smeared, in cells of the grid.
 
-
+These are the ratios of Karto's defaults, 0.3 m and 0.03 m for cells of 0.01 m.
+"""
 FINEST_DEG = 0.25
-"""Spacing of beams: those that are closer are put together, which costs it nothing that could be measured."""
+"""Degrees; beams with a smaller spacing are merged, which had no measurable effect on the accuracy."""
 
 
 class Karto(Peer):
-    """Karto's matcher alone, without odometry: the guess is the last motion. ``voxel`` is its grid's cell."""
+    """Karto's matcher without odometry: the initial guess is the last motion. ``voxel`` is its cell size."""
 
     name = "karto"
     package = "karto-scanmatcher"
 
     def aligner(self) -> "KartoAligner":
-        """The peer before its first scan."""
+        """Makes the peer, before its first scan."""
         return KartoAligner(self.imported("karto_scanmatcher"), self.options["voxel"], self.sensor)
 
 
 class KartoAligner:
-    """The last scans where the matcher has put them."""
+    """Karto's matcher with the last scans and their estimated poses."""
 
     def __init__(self, library: Any, cell: float, sensor: Sensor) -> None:
-        self._library, self._sensor = library, _coarser(sensor)
+        self._library, self._sensor = library, _limit_resolution(sensor)
         sensor = self._sensor
         config = library.ScanMatcherConfig()
         config.resolution, config.range_threshold = cell, sensor.max_range
@@ -62,31 +62,32 @@ class KartoAligner:
         self._count = 0
 
     def add(self, scan: Scan, points: FloatArray) -> FloatArray:
-        """Takes one more scan; the pose (4, 4)."""
-        # It wants evenly spaced beams. 0 would be a point at the laser.
+        """Adds one more scan; returns the laser's pose (4, 4)."""
+        # Karto requires evenly spaced beams. A range of 0 would be a point at the laser.
         depths = self._sensor.encode(scan)
         ranges = np.where(depths > 0, depths, np.inf).tolist()
         guess = self._pose @ self._motion
         pose = guess
         if self._scans:
             found = self._matcher.match_scan(
-                self._localized(ranges, guess), list(self._scans), True, True
+                self._make_scan(ranges, guess), list(self._scans), True, True
             ).best_pose
             pose = planar_to_poses([[found.x, found.y, found.yaw]])[0]
             self._motion = np.linalg.inv(self._pose) @ pose
-        self._scans.append(self._localized(ranges, pose))
+        self._scans.append(self._make_scan(ranges, pose))
         self._pose = pose
         self._count += 1
         return pose
 
-    def _localized(self, ranges: list[float], pose: FloatArray) -> Any:
+    def _make_scan(self, ranges: list[float], pose: FloatArray) -> Any:
+        """Karto's object of a scan with the pose (4, 4) of its laser."""
         x, y, yaw = float(pose[0, 3]), float(pose[1, 3]), float(np.arctan2(pose[1, 0], pose[0, 0]))
         place = self._library.Pose2(x, y, yaw)
         return self._library.LocalizedRangeScan(self._laser, ranges, place, place, self._count, 0.0)
 
 
-def _coarser(sensor: Sensor) -> Sensor:
-    """The same laser with beams no closer than ``FINEST_DEG``."""
+def _limit_resolution(sensor: Sensor) -> Sensor:
+    """The same sensor with a spacing of at least ``FINEST_DEG``."""
     beams = max(1, int(sensor.field_of_view_deg / FINEST_DEG))
     spacing = max(sensor.resolution_deg, sensor.field_of_view_deg / beams)
     return replace(sensor, resolution_deg=spacing)

@@ -1,7 +1,7 @@
-"""KISS-ICP: points against a map of voxels, with a gate that follows the motion.
+"""KISS-ICP: point-to-point matching with a voxel map and an adaptive distance threshold.
 
 Vizzo, Guadagnino, Mersch, Wiesmann, Behley and Stachniss, "KISS-ICP: In Defense of Point-to-Point ICP",
-IEEE Robotics and Automation Letters 8, 2023. It is point to point, so that z = 0 does it no harm.
+IEEE Robotics and Automation Letters 8, 2023. Point-to-point matching also works if z = 0 for all points.
 """
 
 from typing import Any
@@ -14,13 +14,13 @@ from rcnn_odom.recordings.scan import Scan
 
 
 class KissICP(Peer):
-    """KISS-ICP with its own settings, but for the voxel, the laser's range and one thread."""
+    """KISS-ICP with its default settings, except for the voxel size, the laser's range and one thread."""
 
     name = "kiss_icp"
     package = "kiss-icp"
 
     def aligner(self) -> "KissAligner":
-        """The peer before its first scan."""
+        """Makes the peer, before its first scan."""
         config = self.imported("kiss_icp.config").KISSConfig(
             data={"max_range": self.sensor.max_range, "min_range": 0.0, "deskew": False},
             mapping={"voxel_size": self.options["voxel"]},
@@ -36,6 +36,6 @@ class KissAligner:
         self._odometry = odometry
 
     def add(self, scan: Scan, points: FloatArray) -> FloatArray:
-        """Takes one more scan's points (P, 3); the pose (4, 4)."""
+        """Adds the points (P, 3) of one more scan; returns the laser's pose (4, 4)."""
         self._odometry.register_frame(points, np.empty(0))
         return np.array(self._odometry.last_pose)

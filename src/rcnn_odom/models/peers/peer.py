@@ -1,4 +1,4 @@
-"""What the peers have in common: a scan goes in, the peer tells its own pose, a step comes out."""
+"""The common parts of the peers: a peer gets a scan and returns its pose, from which the step follows."""
 
 from abc import abstractmethod
 from dataclasses import dataclass
@@ -17,40 +17,42 @@ from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.recordings.scan import Scan
 
 FEWEST_POINTS = 10
-"""Fewer say nothing, and some of the peers end the process when they are given none."""
+"""Scans with fewer points are not matched; without any points, some peers would end the process."""
 
 
 class Aligner(Protocol):
-    """A peer with everything that it remembers."""
+    """A peer with its map or its earlier scans."""
 
     def add(self, scan: Scan, points: FloatArray) -> FloatArray:
         """Takes one more scan.
 
         Args:
             scan: as the laser gave it.
-            points: (P, 3) metres, its returns in the laser's frame, with z = 0.
+            points: (P, 3) returns of the scan in the laser's frame, in metres, with z = 0.
 
         Returns:
-            (4, 4) where the laser is by the peer, in a frame that it keeps.
+            The peer's estimate of the laser's pose (4, 4), in a frame that does not change.
         """
 
 
 @dataclass(frozen=True)
 class PeerOptions:
-    """What ``conf/model`` sets.
+    """The options of the peers in ``conf/model``.
 
     Attributes:
-        voxel: metres, the peer's cell: how coarse its points and its map are.
+        voxel: metres; size of the peer's cells, which is the resolution of its points and its map.
     """
 
     voxel: float = option(above=0)
 
 
 class Peer(Model):
-    """A matcher of another project. How far off its steps may be is not known, and nothing is undistorted.
+    """Base class for matchers of other projects.
+
+    The covariances of their steps are unknown, and scans are not corrected for the motion during the scan.
 
     Attributes:
-        package: what ``pip`` calls it.
+        package: name of the package for ``pip``.
     """
 
     Options = PeerOptions
@@ -70,14 +72,14 @@ class Peer(Model):
         return PeerTracker(self)
 
     def estimate(self, drive: Drive) -> Steps:
-        """The steps of one whole drive."""
+        """The steps of a whole drive."""
         return estimate_by_tracking(self.tracker(), drive.raw_scans())
 
     def imported(self, module: str) -> Any:
-        """A module of the peer's package.
+        """Imports a module of the peer's package.
 
         Raises:
-            InputError: it is not installed.
+            InputError: the package is not installed.
         """
         try:
             return import_module(module)
@@ -88,15 +90,15 @@ class Peer(Model):
 
 
 class PeerTracker:
-    """A peer as a :class:`rcnn_odom.models.streaming.ScanTracker`.
+    """A :class:`rcnn_odom.models.streaming.ScanTracker` for a peer.
 
-    A step suffers from:
+    Notes are of these kinds:
 
-    - *no match*: the scan has too few returns, and the last motion goes on.
-    - *error*: the peer raised an error or said nan; the last motion goes on, and the peer begins anew.
+    - *no match*: the scan has too few returns; the last motion goes on.
+    - *error*: the peer raised an error or returned nan; the last motion goes on, and the peer is reset.
 
     Args:
-        peer: gives the aligner.
+        peer: makes the aligner.
     """
 
     period = float("nan")
@@ -128,7 +130,7 @@ class PeerTracker:
         return self.register(scan).notes
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
-        """The step to one more scan; see the class."""
+        """The step to one more scan; the class lists the notes."""
         self._points = points_of(scan, self._peer.sensor)
         if len(self._points) < FEWEST_POINTS:
             note = f"no match: {len(self._points)} returns, {FEWEST_POINTS} are needed"
@@ -137,7 +139,7 @@ class PeerTracker:
             pose = self._aligner.add(scan, self._points)
             if not np.isfinite(pose).all():
                 raise ValueError("its pose is not finite")
-        except Exception as error:  # whatever the code of another project does
+        except Exception as error:  # the code of another project can raise any error
             self._aligner, self._pose, self._has_seen = self._peer.aligner(), np.eye(4), False
             note = f"error: {self._peer.name}: {type(error).__name__}: {error}"
             return Registered(self._last, (note,), is_estimated=False)
@@ -152,7 +154,12 @@ def points_of(scan: Scan, sensor: Sensor) -> FloatArray:
 
     Args:
         scan: as the laser gave it.
-        sensor: from whose ``max_range`` on a range is no return; tells bearings where the scan does not.
+        sensor: ranges of its ``max_range`` or more are no returns; its field of view gives the bearings if
+            the scan has none.
+
+    Example:
+        >>> points_of(Scan(np.array([1.0, 90.0]), np.array([0.0, 0.5])), Sensor(max_range=80.0)).tolist()
+        [[1.0, 0.0, 0.0]]
     """
     bearings = sensor.bearings_of(scan)
     seen = (scan.ranges > 0) & (scan.ranges < sensor.max_range) & np.isfinite(bearings)

@@ -1,8 +1,8 @@
 """small_gicp: point-to-point ICP from scan to scan.
 
 Koide, "small_gicp: Efficient and parallel algorithms for point cloud registration", Journal of Open Source
-Software 9, 2024. Its ``PLANE_ICP`` fits planes to the points: where z = 0 everywhere, every plane is
-the floor, and the estimate stands still without a word. Its ``GICP`` gives there what point to point does.
+Software 9, 2024. Its ``PLANE_ICP`` fits planes to the points. If z = 0 for all points, every plane is the
+floor, and the estimate does not move, without any message. Its ``GICP`` then equals point-to-point ICP.
 """
 
 from typing import Any
@@ -14,26 +14,32 @@ from rcnn_odom.models.peers.peer import Peer
 from rcnn_odom.recordings.scan import Scan
 
 GATE_IN_VOXELS = 4.0
-"""Metres between partners at most, in voxels: as in its own defaults, 1 m and 0.25 m."""
+"""Maximum distance between corresponding points as a multiple of the voxel size.
+
+This is the ratio of the package's defaults, 1 m and 0.25 m.
+"""
 
 SETTLED, MOST_ITERATIONS = 1e-4, 50
-"""Metres or radians of a change that is the last: a tenth of its own defaults and less, because a robot moves
-a few centimetres from scan to scan."""
+"""The iteration ends after a change of fewer metres and radians, or after so many iterations.
+
+The first is at most a tenth of the package's defaults, because a robot moves only a few centimetres between
+scans.
+"""
 
 
 class SmallGICP(Peer):
-    """small_gicp on one thread; the guess is the last motion, as in its own example of odometry."""
+    """small_gicp on one thread; the initial guess is the last motion, as in its own odometry example."""
 
     name = "small_gicp"
     package = "small_gicp"
 
     def aligner(self) -> "SmallGICPAligner":
-        """The peer before its first scan."""
+        """Makes the peer, before its first scan."""
         return SmallGICPAligner(self.imported("small_gicp"), self.options["voxel"])
 
 
 class SmallGICPAligner:
-    """The last scan, which the next is aligned with."""
+    """small_gicp with the last scan, with which the next one is aligned."""
 
     def __init__(self, library: Any, voxel: float) -> None:
         self._library, self._voxel = library, voxel
@@ -42,7 +48,7 @@ class SmallGICPAligner:
         self._pose, self._motion = np.eye(4), np.eye(4)
 
     def add(self, scan: Scan, points: FloatArray) -> FloatArray:
-        """Takes one more scan's points (P, 3); the pose (4, 4)."""
+        """Adds the points (P, 3) of one more scan; returns the laser's pose (4, 4)."""
         cloud = self._library.voxelgrid_sampling(points, self._voxel)
         if self._target is not None:
             found = self._library.align(
