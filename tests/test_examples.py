@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pytest
 
+import rcnn_odom
 from rcnn_odom import matching
 
 MODULES = [
@@ -22,13 +23,14 @@ MODULES = [
     "rcnn_odom.models.matcher",
     "rcnn_odom.deployment.odometer",
 ]
-SOME_EXAMPLES = [
-    *(f"rcnn_odom.deployment.{name}" for name in ("output", "ros_messages", "run", "sampling")),
-    "rcnn_odom.evaluation.metrics",
-    "rcnn_odom.evaluation.run_folder",
-    "rcnn_odom.evaluation.scores",
-    *(f"rcnn_odom.evaluation.sweep_report.{name}" for name in ("document", "folders", "options")),
-]
+PACKAGE = Path(rcnn_odom.__file__).parent
+SOME_EXAMPLES = sorted(
+    name
+    for file in PACKAGE.rglob("*.py")
+    if ">>>" in file.read_text(encoding="utf-8")
+    and (name := ".".join(file.relative_to(PACKAGE.parent).with_suffix("").parts).removesuffix(".__init__"))
+    not in MODULES
+)
 """Modules whose examples are run, although not every public part has one."""
 FLAGS = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
 

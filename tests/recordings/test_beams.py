@@ -59,9 +59,9 @@ def test_where_beams_lie(bearings, expected):
         (np.arange(0.0, 360.0), "more than a circle"),
         (even(0, 1, 500), "its beams span 499 degrees"),
         (np.full(181, 0.3), "its beams all point the same way"),
-        (np.full(181, np.nan), "not finite, or wild"),
-        (np.append(even(-90, 1, 180), np.inf), "not finite, or wild"),
-        (np.linspace(-1e300, 1e300, 181), "not finite, or wild"),
+        (np.full(181, np.nan), "not finite, or too large to be angles"),
+        (np.append(even(-90, 1, 180), np.inf), "not finite, or too large to be angles"),
+        (np.linspace(-1e300, 1e300, 181), "not finite, or too large to be angles"),
     ],
 )
 def test_bearings_that_are_none(bearings, says):
@@ -141,7 +141,7 @@ def test_beams_that_no_sensor_fits():
     check = BeamCheck(HALF)
     check(scan(even(-90, 20, 10), frame_id="laser"))
     assert str(check.refusal("log", "set {}")).endswith(
-        "one every 1 (frame laser); no sensor has them so far apart, 10 degrees at most"
+        "one every 1 (frame laser); no sensor has beams so far apart, 10 degrees at most"
     )
 
 
@@ -190,5 +190,6 @@ def test_a_ring_of_returns_is_compared_by_what_is_known_of_its_laser():
     velodyne = Beams(-180.0, 360.0, 0.18)
     assert compare_beams(velodyne, ROUND) == ""
     assert compare_beams(velodyne, HALF) == (
-        "its beams lie all round, one every 0.18 degrees, the sensor's from -90 to 90 degrees, one every 1"
+        "its beams lie all round, one every 0.18 degrees, "
+        "but the sensor's lie from -90 to 90 degrees, one every 1"
     )

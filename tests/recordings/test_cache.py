@@ -303,7 +303,7 @@ def test_single_scans_of_other_beams_have_no_returns(tmp_path):
     [
         (
             np.arange(-90.0, 1.0),
-            "its beams lie from -90 to 0 degrees, one every 1, the sensor's from -90 to 90",
+            "its beams lie from -90 to 0 degrees, one every 1, but the sensor's lie from -90 to 90",
         ),
         (np.arange(0.0, 180.0), "set data.sensor.field_of_view_deg=180 .* data.sensor.facing_deg=90"),
         (np.rad2deg(np.arange(-90.0, 91.0)), "more than a circle, as if its angles were not in radians"),

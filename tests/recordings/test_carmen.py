@@ -115,9 +115,9 @@ def test_field_of_view_is_an_option(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("degrees", [math.nan, math.inf, 0.0, -180.0, 360.5])
 def test_an_option_that_is_no_field_of_view(tmp_path: Path, degrees: float) -> None:
-    with pytest.raises(InputError, match=r"field_of_view_deg of .*; set it above 0 and at most 360"):
+    with pytest.raises(InputError, match=r"field of view is .* degrees; set it above 0 and at most 360"):
         load_lines(tmp_path, flaser("1 2 3"), field_of_view_deg=degrees)
-    with pytest.raises(InputError, match=r"field_of_view_deg of .*; set it above 0 and at most 360"):
+    with pytest.raises(InputError, match=r"field of view is .* degrees; set it above 0 and at most 360"):
         carmen.stream(tmp_path / "log.log", field_of_view_deg=degrees)
 
 
@@ -367,8 +367,8 @@ def test_readings_stand_before_the_maximum_of_robotlaser_lines(tmp_path: Path, m
             np.where(ranges == MAX_READING, np.inf, ranges), right.read_scan(frame).ranges
         )
         np.testing.assert_array_equal(streamed.ranges, ranges)
-    assert "30 lines' maximum is not believed: most readings lie beyond it" in said.notes
-    assert "not believed" not in notes_of(right)
+    assert "the maximum range of 30 lines is not used: most of their readings lie beyond it" in said.notes
+    assert "is not used" not in notes_of(right)
 
 
 def test_centimetres_are_told_whatever_the_maximum(tmp_path: Path) -> None:
@@ -376,7 +376,7 @@ def test_centimetres_are_told_whatever_the_maximum(tmp_path: Path) -> None:
         assert re.search(
             r"half of its readings are .*cannot be metres", BeamCheck(Sensor(1.0, 180.0, 40.0))(scan)
         )
-    assert "30 lines' maximum is not believed" in notes_of(carmen.load("said", root=tmp_path))
+    assert "the maximum range of 30 lines is not used" in notes_of(carmen.load("said", root=tmp_path))
 
 
 # PARAM lines about the laser of FLASER lines
@@ -434,7 +434,7 @@ def test_notes_say_where_the_field_of_view_is_from(tmp_path: Path) -> None:
     assert "field of view: 270 degrees by the log's PARAM laser_front_laser_resolution 0.5" in said.notes
     assert "field of view: 240 degrees, as given" in load_lines(tmp_path, line, field_of_view_deg=240.0).notes
     said = load_lines(tmp_path, f"{RESOLUTION} 50 nohost 0", line)
-    assert "is not that of 541 readings; field of view: 180 degrees, the usual" in notes_of(said)
+    assert "does not fit 541 readings; field of view: 180 degrees, the default" in notes_of(said)
 
 
 FOV, RESOLUTION = "PARAM laser_front_laser_fov", "PARAM laser_front_laser_resolution"
@@ -454,7 +454,7 @@ def test_params_that_contradict_each_other(tmp_path: Path, params: list[str], ma
     line = flaser(" ".join(["1.5"] * 541))
     with pytest.raises(InputError, match=match) as raised:
         load_lines(tmp_path, *params, line)
-    for part in ("; say", "data.field_of_view_deg=", "--field-of-view-deg"):
+    for part in ("; set", "data.field_of_view_deg=", "--field-of-view-deg"):
         assert part in str(raised.value)
     with pytest.raises(InputError, match=match):
         carmen.stream(tmp_path / "log.log")
@@ -478,7 +478,7 @@ def test_a_resolution_in_radians_is_told(tmp_path: Path, params: list[str], coun
     line = flaser(" ".join(["1.5"] * count))
     with pytest.raises(InputError, match="is it in radians, not degrees") as raised:
         load_lines(tmp_path, *params, line)
-    for part in (f"{params[-1]} (degrees)", "; say", "data.field_of_view_deg=", "--field-of-view-deg"):
+    for part in (f"{params[-1]} (degrees)", "; set", "data.field_of_view_deg=", "--field-of-view-deg"):
         assert part in str(raised.value)
     with pytest.raises(InputError, match="is it in radians, not degrees"):
         carmen.stream(tmp_path / "log.log")
@@ -499,12 +499,12 @@ def test_narrow_and_fine_lasers_are_in_degrees(
 @pytest.mark.parametrize(
     ("param", "fault"),
     [
-        ("laser_front_laser_fov 3,1416", "laser_front_laser_fov 3,1416 is no number"),
-        ("laser_front_laser_fov = 4.712389", "laser_front_laser_fov = is no number"),
-        ("laser_frontlaser_resolution nan", "laser_frontlaser_resolution nan is no number"),
+        ("laser_front_laser_fov 3,1416", "laser_front_laser_fov 3,1416 is not a number"),
+        ("laser_front_laser_fov = 4.712389", "laser_front_laser_fov = is not a number"),
+        ("laser_frontlaser_resolution nan", "laser_frontlaser_resolution nan is not a number"),
         ("laser_front_laser_fov -4.712389", "laser_front_laser_fov -4.712389 is not above 0"),
-        ("robot_front_laser_max none", "robot_front_laser_max none is no number"),
-        ("robot_front_laser_max " + "9" * 5000, f"robot_front_laser_max {'9' * 40} is no number"),
+        ("robot_front_laser_max none", "robot_front_laser_max none is not a number"),
+        ("robot_front_laser_max " + "9" * 5000, f"robot_front_laser_max {'9' * 40} is not a number"),
         ("laser_front_laser_fov 0", ""),
         ("laser_rear_laser_fov 3,1416", ""),
     ],
@@ -515,7 +515,7 @@ def test_a_param_that_is_no_number_is_told(
     lines = [f"PARAM {param} nohost 0"] * 3 + [flaser(" ".join(["1.5"] * 361))]
     sequence = load_lines(tmp_path, *lines)
     assert first_and_spacing(sequence.read_scan(0)) == pytest.approx((-90, 0.5))
-    told = [f"the log's PARAM {fault}, not used"] if fault else []
+    told = [f"the log's PARAM {fault}, so it is not used"] if fault else []
     assert [note for note in sequence.notes if "PARAM" in note] == told
     assert len(list(carmen.stream(tmp_path / "log.log").scans)) == 1
     assert caplog.messages == [f"{tmp_path / 'log.log'}: {note}" for note in told]
@@ -530,7 +530,7 @@ def test_another_number_of_beams_than_params_allow(tmp_path: Path, params: list[
     lines = [*params, *[full] * 40, *[half] * 20]
     match = (
         rf"log\.log:{len(params) + 41}: broken FLASER line \(90 readings, 1 degrees apart by the log's PARAM "
-        r"lines, do not cover 180 degrees; if they do, say so with data\.field_of_view_deg"
+        r"lines, do not cover 180 degrees; if they do, set data\.field_of_view_deg"
     )
     with pytest.raises(InputError, match=match):
         load_lines(tmp_path, *lines)
@@ -597,7 +597,7 @@ def test_readings_stand_before_a_params_maximum(tmp_path: Path) -> None:
     line = flaser("1 2 9 11 12 13 51.15 51.15 51.15 51.15")
     sequence = load_lines(tmp_path, "PARAM robot_front_laser_max 10 nohost 0", line)
     assert np.isfinite(sequence.read_scan(0).ranges).all()
-    assert "robot_front_laser_max 10 is not believed: 30% of the readings lie beyond it" in notes_of(sequence)
+    assert "robot_front_laser_max 10 is not used: 30% of the readings lie beyond it" in notes_of(sequence)
     for value in ("0", "-1", "nan", "none"):
         sequence = load_lines(tmp_path, f"PARAM robot_front_laser_max {value} nohost 0", line)
         assert np.isfinite(sequence.read_scan(0).ranges).all()
@@ -680,8 +680,8 @@ def test_broken_line(tmp_path: Path, line: str, match: str) -> None:
         (b"\n \n", "is empty; give"),
         (codecs.BOM_UTF8, "is empty; give"),
         (gzip.compress(b"", mtime=0), "is empty; give"),
-        (b"\x00\x01\x02\xff" * 3000, "holds binary data, no text"),
-        (bytes(100), "holds binary data, no text"),
+        (b"\x00\x01\x02\xff" * 3000, "holds binary data, not text"),
+        (bytes(100), "holds binary data, not text"),
         (flaser().encode("utf-16"), "is text in UTF-16; save it as UTF-8"),
         (flaser().encode("utf-16-le"), "is text in UTF-16; save it as UTF-8"),
         (flaser().encode("utf-16-be"), "is text in UTF-16; save it as UTF-8"),
@@ -917,7 +917,7 @@ def test_cases_that_scan_matching_agrees_with(cases: Path, name: str, most: floa
 @pytest.mark.parametrize(
     ("name", "absent", "notes"),
     [
-        ("edmonton", 0, "PARAM robot_front_laser_max 10 is not believed: 29%"),
+        ("edmonton", 0, "PARAM robot_front_laser_max 10 is not used: 29%"),
         ("fhw", 0, "180 degrees by the log's PARAM laser_frontlaser_resolution 1"),
         ("freiburg-101", 12555, "PARAM robot_front_laser_max 80.99 m or beyond are no returns"),
     ],

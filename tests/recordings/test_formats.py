@@ -84,7 +84,9 @@ def test_an_added_format_is_asked_first_and_given_its_options(tmp_path, add, cap
     options = {"topic": "/scan", "ring": 2, "field_of_view_deg": None}
     assert open_stream(tmp_path / "robot.log", options).name == "robot.log"
     for option in ("topic", "ring"):
-        assert f"robot.log: read as carmen, which has no option {option}; it is left out" in caplog.text
+        assert (
+            f"robot.log: read as carmen, which has no option {option}; the option is ignored" in caplog.text
+        )
     add(STREAMS)
     assert open_stream(tmp_path / "robot.log", options).name == "toy 2"
     assert open_stream(tmp_path / "robot.log").name == "toy None"

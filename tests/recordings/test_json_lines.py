@@ -229,7 +229,7 @@ def test_one_topic_of_rosbridge() -> None:
     )
     with pytest.raises(InputError, match=f"no scan of topic /side in it, only {only}; choose one of these"):
         list(json_lines.stream_lines(texts, topic="/side").scans)
-    broken = r"only lines that are no scan \(line 7: ranges is 5, no list\), messages of /front, "
+    broken = r"only lines that are no scan \(line 7: ranges is 5, not a list\), messages of /front, "
     with pytest.raises(InputError, match=f"no scan of topic sick in it, {broken}"):
         list(json_lines.stream_lines(texts, topic="sick").scans)
     with pytest.raises(InputError, match="/scan in it, only messages without a topic; leave --topic out"):
@@ -248,7 +248,7 @@ def test_one_topic_of_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize("angle", ["angle_increment", "angle_max"])
 @pytest.mark.parametrize("value", [-0.25, 0, "NaN"])
 def test_angles_without_a_first_one_are_not_dropped(angle: str, value: object) -> None:
-    with pytest.raises(InputError, match=f"line 1: {angle}, but no angle_min in it; "):
+    with pytest.raises(InputError, match=f"line 1: it has {angle}, but no angle_min; "):
         scan_of({"ranges": [1, 2], angle: value})
     assert scan_of({"ranges": [1, 2], angle: None}).bearings is None
 
@@ -256,22 +256,22 @@ def test_angles_without_a_first_one_are_not_dropped(angle: str, value: object) -
 @pytest.mark.parametrize(
     ("changes", "says"),
     [
-        ({"angle_min": None}, "angle_min is null, no number"),
-        ({"angle_increment": "wide"}, 'angle_increment is "wide", no number'),
-        ({"angle_max": []}, "angle_max is a list, no number"),
-        ({"stamp": "2020-01-01"}, 'stamp is "2020-01-01", no number'),
-        ({"stamp": True}, "stamp is true, no number"),
-        ({"header": {"stamp": "2020-01-01"}}, 'header.stamp is "2020-01-01", no number'),
-        ({"header": {"stamp": {"secs": "noon"}}}, 'seconds of header.stamp is "noon", no number'),
-        ({"stamp": {"sec": 1, "nanosec": {}}}, "nanoseconds of stamp is an object, no number"),
-        ({"range_max": "x"}, 'range_max is "x", no number'),
-        ({"range_min": "x" * 1000}, f'range_min is "{"x" * 39}..., no number'),
-        ({"time_increment": False}, "time_increment is false, no number"),
-        ({"ranges": ["one"]}, 'a reading is "one", no number'),
-        ({"ranges": None}, "ranges is null, no list"),
-        ({"ranges": None, "points": [[1, "y"]]}, 'a coordinate is "y", no number'),
-        ({"points": 3}, "points is 3, no list"),
-        ({"points": [[1]]}, r"points is no list of \[x, y\]"),
+        ({"angle_min": None}, "angle_min is null, not a number"),
+        ({"angle_increment": "wide"}, 'angle_increment is "wide", not a number'),
+        ({"angle_max": []}, "angle_max is a list, not a number"),
+        ({"stamp": "2020-01-01"}, 'stamp is "2020-01-01", not a number'),
+        ({"stamp": True}, "stamp is true, not a number"),
+        ({"header": {"stamp": "2020-01-01"}}, 'header.stamp is "2020-01-01", not a number'),
+        ({"header": {"stamp": {"secs": "noon"}}}, 'seconds of header.stamp is "noon", not a number'),
+        ({"stamp": {"sec": 1, "nanosec": {}}}, "nanoseconds of stamp is an object, not a number"),
+        ({"range_max": "x"}, 'range_max is "x", not a number'),
+        ({"range_min": "x" * 1000}, f'range_min is "{"x" * 39}..., not a number'),
+        ({"time_increment": False}, "time_increment is false, not a number"),
+        ({"ranges": ["one"]}, 'a reading is "one", not a number'),
+        ({"ranges": None}, "ranges is null, not a list"),
+        ({"ranges": None, "points": [[1, "y"]]}, 'a coordinate is "y", not a number'),
+        ({"points": 3}, "points is 3, not a list"),
+        ({"points": [[1]]}, r"points is not a list of \[x, y\]"),
     ],
 )
 def test_faults_are_told_by_field_and_value(changes: dict[str, object], says: str) -> None:
@@ -283,12 +283,12 @@ def test_faults_are_told_by_field_and_value(changes: dict[str, object], says: st
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("{]", "no JSON from its character 2 on"),
-        ("[1, 2]", "a list is no JSON object"),
-        ("null", "null is no JSON object"),
-        ('{"points": null}', "points is null, no list"),
-        ("{}", "neither a list of ranges nor of points in it"),
-        ("[" * 100_000, "no JSON with numbers of a usual length and lists of a usual depth"),
+        ("{]", "it is not JSON from character 2 on"),
+        ("[1, 2]", "a list is not a JSON object"),
+        ("null", "null is not a JSON object"),
+        ('{"points": null}', "points is null, not a list"),
+        ("{}", "it has neither a list of ranges nor a list of points"),
+        ("[" * 100_000, "its numbers are too long, or its lists too deeply nested"),
     ],
 )
 def test_lines_of_something_else_are_told(line: str, says: str) -> None:

@@ -296,7 +296,7 @@ def in_place(index, value):
         (
             in_place([0, 1], lambda two: two[::-1]),
             range(6),
-            "the places move [5-9][0-9] degrees aside of yaw",
+            "the car moves [5-9][0-9] degrees off its yaw angle",
         ),
     ],
     ids=["jump", "latitude 0", "degrees", "swapped"],
@@ -348,7 +348,7 @@ def test_no_scans(root: Path) -> None:
 def test_the_folder_of_a_date_or_of_dates_lists_its_drives(root: Path) -> None:
     make_kitti_raw(root, "2011_09_26_drive_0009_sync", frames=2)
     text = refusal(lambda: open_stream(root / "2011_09_26"))
-    assert "holds drives of KITTI raw and is none itself; give one of" in text
+    assert "holds KITTI raw drives but is not one itself; give one of" in text
     assert text.endswith(f"{NAME}, 2011_09_26_drive_0009_sync")
     assert f"give one of 2011_09_26/{NAME}, 2011_09_26/2011" in refusal(lambda: open_stream(root))
 
@@ -395,7 +395,7 @@ def test_a_drive_that_is_not_there(root: Path) -> None:
         ),
         ("oxts/data/0000000002.txt", 1, "49.0 8.4 100 0 nan 0", "2.txt:1: found nan or inf, but it begins"),
         ("oxts/data/0000000002.txt", 1, "49.0 8.4", "2.txt:1: found 2 fields, but it begins with latitude"),
-        ("oxts/data/0000000002.txt", 1, "490.0 8.4 1 0 0 0", "2.txt:1: no place on earth, but it begins"),
+        ("oxts/data/0000000002.txt", 1, "490.0 8.4 1 0 0 0", "2.txt:1: not a place on earth, but it begins"),
         ("../calib_velo_to_cam.txt", 2, "R: 1 0 0", "velo_to_cam.txt:2: found 3 fields, but R has 9 finite"),
         ("../calib_velo_to_cam.txt", 2, "R: 1 0 0 0 1 0 0 0 5", "velo_to_cam.txt:2: R holds no rotation; "),
         ("../calib_imu_to_velo.txt", 3, "T 1 0 0", "imu_to_velo.txt: no line starts with 'T:'; "),
@@ -418,8 +418,8 @@ def test_damaged_lines(root: Path, file: str, line: int, text: str, says: str) -
 @pytest.mark.parametrize(
     ("line", "says"),
     [
-        ("1 2 x 0", "0000000001.txt:5: '1 2 x 0' is no point, x y z reflectance; correct the line"),
-        ("1 2", "0000000001.txt:5: '1 2' is no point"),
+        ("1 2 x 0", "0000000001.txt:5: '1 2 x 0' is not a point, x y z reflectance; correct the line"),
+        ("1 2", "0000000001.txt:5: '1 2' is not a point"),
     ],
 )
 def test_damaged_text_points(root: Path, line: str, says: str) -> None:

@@ -134,8 +134,8 @@ def test_times_that_cannot_be_are_unknown():
         ((-1.5708, 0.0174533, 0.0), 181, ""),  # not set
         ((-1.5708, 0.0174533, math.nan), 181, ""),
         ((-1.5708, 0.0, 1.5708), 181, ""),
-        ((-1.5708, 0.00872665, 1.5708), 181, "cover 180 degrees, its angle_increment and 181 readings 90;"),
-        ((-1.5708, 0.0174533, 1.5708), 91, "cover 180 degrees, its angle_increment and 91 readings 90;"),
+        ((-1.5708, 0.00872665, 1.5708), 181, "its angle_increment and 181 readings say 90;"),
+        ((-1.5708, 0.0174533, 1.5708), 91, "cover 180 degrees, its angle_increment and 91 readings say 90;"),
     ],
 )
 def test_angles_that_contradict_each_other(angles, count, told):

@@ -13,7 +13,7 @@ from rcnn_odom.recordings import carmen, logs
 from rcnn_odom.recordings.formats import open_stream
 from rcnn_odom.recordings.parts import cut, trusted_pieces
 from rcnn_odom.recordings.recording import Drive
-from rcnn_odom.recordings.reference import find_trajectory, in_laser_frame, plain_name
+from rcnn_odom.recordings.reference import find_trajectory, in_laser_frame, strip_endings
 from rcnn_odom.recordings.trajectory import write_kitti, write_tum
 
 PLANAR = np.column_stack([np.linspace(0, 3, 12), np.linspace(0, 0.5, 12), np.linspace(0, 0.4, 12)])
@@ -144,8 +144,8 @@ def test_the_frame_of_a_trajectory_is_told_from_how_it_turns(planar):
 
 
 def test_names_of_trajectories(tmp_path):
-    assert plain_name("a/b.c.mcap.zstd") == "b.c"
-    assert plain_name("folder") == "folder"
+    assert strip_endings("a/b.c.mcap.zstd") == "b.c"
+    assert strip_endings("folder") == "folder"
     for name in ("a_b.bag.txt", "b.tum"):
         (tmp_path / name).touch()
     assert find_trajectory(tmp_path, "a/b.bag", has_clock=True).name == "a_b.bag.txt"
@@ -177,7 +177,7 @@ def test_a_drive_falls_to_pieces_at_doubted_steps(caplog):
     assert [(piece.name, len(piece)) for piece in pieces] == [("a:0-4", 5), ("a:5-8", 4), ("a:10-14", 5)]
     assert "a: 14 of 15 scans to train on, in 3 pieces" in caplog.text
     assert [piece.name for piece in trusted_pieces(drive.part(3, 12), 2)] == ["a:3-4", "a:5-8", "a:10-11"]
-    with pytest.raises(InputError, match="nowhere are 6 scans in a row"):
+    with pytest.raises(InputError, match="no 6 scans in a row are without a doubtful true step"):
         trusted_pieces(drive, 6)
     sure = drive_of([False, True, True])  # there is no step to the first scan
     assert trusted_pieces(sure, 2) == [sure]

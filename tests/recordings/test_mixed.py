@@ -58,9 +58,9 @@ def test_a_recording_is_its_sources_own_under_a_longer_name(log_folder):
 @pytest.mark.parametrize(
     ("name", "changes", "says"),
     [
-        ("robot", {}, "sequence robot: is none of a source; write SOURCE/NAME with one of logs, rooms"),
-        ("log/robot", {}, "sequence log/robot: is none of a source"),
-        ("logs/", {}, "is none of a source"),
+        ("robot", {}, "sequence robot: must be SOURCE/NAME with one of the sources logs, rooms"),
+        ("log/robot", {}, "sequence log/robot: must be SOURCE/NAME with one of the sources"),
+        ("logs/", {}, "must be SOURCE/NAME with one of the sources"),
         ("logs/none", {}, r"data.sources.logs: .*none: no such file"),
         ("logs/robot", {"format": "karmen"}, "data.sources.logs: .*karmen"),
         (
@@ -101,8 +101,8 @@ def test_a_part_of_the_sensor_fits_where_the_user_says_so(scan):
     [
         (even(-180, 1, 360), "no part of the sensor's from -135 to 135 degrees"),
         (even(0, 1, 181), "no part of the sensor's"),
-        (even(-90, 0.05, 3601), "one every 0.05, no part"),
-        (even(-90, 12, 16), "one every 12, no part"),
+        (even(-90, 0.05, 3601), "one every 0.05, which is no part"),
+        (even(-90, 12, 16), "one every 12, which is no part"),
         (Scan(np.full(181, 5.0), np.arange(-90.0, 91.0)), "as if its angles were not in radians"),
         (even(-90, 1, 181, np.linspace(500, 39000, 181)), "cannot be metres"),
         (Scan(np.ones(1), np.zeros(1)), "a single beam"),

@@ -73,7 +73,7 @@ def test_which_topic_of_a_bag(tmp_path, kind):
         open_stream(several)
     with pytest.raises(InputError, match=f"no topic /side; {choice}"):
         open_stream(several, {"topic": "/side", "ring": None})
-    with pytest.raises(InputError, match=f"/words holds std_msgs/msg/String, which is no scan; {choice}"):
+    with pytest.raises(InputError, match=f"/words holds std_msgs/msg/String, which is not a scan; {choice}"):
         open_stream(several, {"topic": "/words"})
     for name in ("/back", "back"):
         assert len(read(several, topic=name)[1]) == 12
@@ -134,7 +134,7 @@ def test_definitions_do_not_matter_in_ros1(tmp_path, definition, index):
         scans.extend(stream.scans)
     else:
         with pytest.raises(
-            InputError, match=r"breaks off after 12 scans \(its recording was not closed\); what"
+            InputError, match=r"breaks off after 12 scans \(its recording was not closed\); these"
         ):
             scans.extend(stream.scans)
     check_scans(scans, RANGES)
@@ -231,7 +231,7 @@ def test_messages_that_cannot_be_read_are_skipped_and_counted(tmp_path, kind):
             check_scans(scans, RANGES[[0, 0]])
             assert stream.skipped == {"messages that cannot be read": 2}
             continue
-        why = r"none of its 40 messages of /scan can be read \(its 13 bytes are no LaserScan\); "
+        why = r"none of its 40 messages of /scan can be read \(its 13 bytes are not a LaserScan\); "
         with pytest.raises(InputError, match=why):
             read(path)
 

@@ -283,7 +283,7 @@ def test_skew_and_rates_are_chosen_on_the_command_line(configure) -> None:
     [
         ("data.laser.kind=kinect", "data.laser.kind=kinect: choose one of hdl64"),
         ("data.laser={kind: sick, spacing_deg: 5}", "data.laser.spacing_deg=5"),
-        ("data.laser=sick", "data.laser=sick: has parts to set, for instance data.laser.kind=..."),
+        ("data.laser=sick", "data.laser=sick: is a group; set its members, for instance data.laser.kind=..."),
         ("data.realism.skew=maybe", "data.realism.skew=maybe"),
         ("data.scan_rate_hz=0", "data.scan_rate_hz=0"),
         ("data.turn_rate_deg_s=-3", "data.turn_rate_deg_s=-3"),

@@ -202,7 +202,7 @@ def test_a_permuted_recording_gives_the_same_scans(root: Path, order: str) -> No
     reorder(root, PERMUTED[order])
     assert_nearly_all_equal(encoded(root), expected)
     note = kitti.load("00", root=root).notes[1]
-    assert note == "points are not laser by laser; the beam at +0.10 degrees is taken by elevation"
+    assert note == "points are not laser by laser; the beam at +0.10 degrees is found by elevation"
     assert note in kitti.stream(root / "sequences" / "00").notes
 
 
@@ -341,7 +341,7 @@ def test_a_raised_cloud_is_read_by_its_rings(tmp_path: Path, height: float) -> N
     np.testing.assert_array_equal(found.read_scan(1).ranges, wanted.read_scan(1).ranges)
     laser_sequence(tmp_path / "raised", lambda points: shuffle(points + np.array([0, 0, height])))
     with pytest.raises(
-        InputError, match="they gather at no beams as seen from the laser, so they are not in"
+        InputError, match="they do not cluster at beams as seen from the laser, so they are not in"
     ):
         kitti.load("00", root=raised)
 
@@ -366,7 +366,7 @@ def turned(points: np.ndarray, angle: float = 0.05) -> np.ndarray:
     ("change", "says"),
     [
         (turned, r"the points of ring \d+ lie [23]\.\d degrees from their cone"),
-        (lambda points: shuffle(turned(points)), "they gather at no beams as seen from the laser"),
+        (lambda points: shuffle(turned(points)), "they do not cluster at beams as seen from the laser"),
         (lambda points: turned(points, 0.35), "not in the laser's frame|not in its frame|too far from level"),
         (
             lambda points: np.stack([-points[:, 1], -points[:, 2], points[:, 0]], axis=1),
@@ -418,7 +418,7 @@ def test_a_blank_frame_is_a_scan_without_returns(root: Path, blank: str, ring: i
 def test_nothing_but_blank_frames_is_refused(root: Path) -> None:
     for frame in range(4):
         BLANK["nan"].astype("<f4").tofile(scan_file(root, frame))
-    with pytest.raises(InputError, match=r"000000\.bin: neither it nor the other frames have a point; "):
+    with pytest.raises(InputError, match=r"000000\.bin: neither this nor the other frames have a point; "):
         kitti.load("00", root=root)
 
 

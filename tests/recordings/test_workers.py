@@ -13,7 +13,7 @@ import pytest
 from rcnn_odom.errors import InputError
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.cache import Encoding
-from rcnn_odom.recordings.workers import CHUNK, ONE_THREAD, Workers, share
+from rcnn_odom.recordings.workers import CHUNK, ONE_THREAD, Workers, split_frames
 from stub_drives import FRAMES, load
 
 SENSOR = Sensor(1.0, 180.0, 40.0)
@@ -25,7 +25,7 @@ LENGTHS = [FRAMES[name] for name in NAMES]
 @pytest.mark.parametrize("workers", [1, 2, 3, 7, 64])
 @pytest.mark.parametrize("lengths", [KITTI, [5], [1, 1, 1], [64, 128, 65]])
 def test_every_frame_is_dealt_out_once_and_evenly(lengths, workers):
-    shares = share(lengths, workers)
+    shares = split_frames(lengths, workers)
     assert len(shares) == workers
     dealt = [(number, frame) for number, *ends in chain(*shares) for frame in range(*ends)]
     assert dealt == [(number, frame) for number, length in enumerate(lengths) for frame in range(length)]
@@ -35,7 +35,7 @@ def test_every_frame_is_dealt_out_once_and_evenly(lengths, workers):
 
 
 def test_worlds_are_built_once_except_where_two_workers_meet():
-    worlds = [len({number for number, _, _ in pieces}) for pieces in share(KITTI, 4)]
+    worlds = [len({number for number, _, _ in pieces}) for pieces in split_frames(KITTI, 4)]
     assert sum(worlds) <= len(KITTI) + 3
 
 

@@ -9,7 +9,7 @@ from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.recordings.velodyne import ring_starts
 from rcnn_odom.simulation.laser import hdl64_ring, scanner
 from rcnn_odom.simulation.scene import NO_WALLS, Material, Scene, Walls
-from rcnn_odom.simulation.terrain import Ground, flat_ground, stand
+from rcnn_odom.simulation.terrain import Ground, flat_ground, place_on_ground
 
 REAL = SHARED / "data" / "kitti" / "sequences"
 RING_HEIGHT, RING_DROP = 0.206, np.tan(np.deg2rad(0.452))
@@ -47,7 +47,7 @@ def on_the_road(pitch: float = 0.0, roll: float = 0.0, slope: float = 0.0) -> di
     """Median range of the ground in the four directions, of a car on an otherwise empty plain."""
     low = np.full(2, -200.0)
     ground = Ground(low, 400.0, slope * np.array([[-200.0, -200.0], [200.0, 200.0]]))
-    pose = stand(np.zeros((1, 3)), np.array([[pitch, roll]]), 1.73, ground)[0]
+    pose = place_on_ground(np.zeros((1, 3)), np.array([[pitch, roll]]), 1.73, ground)[0]
     points = look(HDL, Scene(NO_WALLS, NO_WALLS, NOWHERE, ground), pose)
     azimuth, ranges = azimuth_deg(points), ranges_of(points)
     directions = {"ahead": 0, "left": 90, "behind": 180, "right": 270}
@@ -170,7 +170,7 @@ def test_uphill_begins_ahead() -> None:
     """A car on the level before a hill sees the hill, as far as the laser's height over its slope."""
     x = np.arange(-200, 201, 5.0)
     ground = Ground(np.full(2, -200.0), 5.0, np.tile(np.maximum(0, 0.1 * (x - 20))[:, None], (1, len(x))))
-    pose = stand(np.zeros((1, 3)), np.zeros((1, 2)), 1.73, ground)[0]
+    pose = place_on_ground(np.zeros((1, 3)), np.zeros((1, 2)), 1.73, ground)[0]
     points = look(HDL, Scene(NO_WALLS, NO_WALLS, NOWHERE, ground), pose)
     ahead = np.abs((azimuth_deg(points) + 180) % 360 - 180) < 3
     expected = (1.73 + RING_HEIGHT + 0.1 * 20) / (0.1 + RING_DROP)
@@ -199,7 +199,9 @@ def test_nothing_beyond_range_comes_back() -> None:
 
 def test_view_from_a_pose_is_that_of_the_moved_world() -> None:
     turned, origin = 0.4, np.array([3.0, -2.0])
-    pose = stand(np.array([[*origin, turned]]), np.zeros((1, 2)), 0.0, flat_ground(-origin, origin + 1))[0]
+    pose = place_on_ground(
+        np.array([[*origin, turned]]), np.zeros((1, 2)), 0.0, flat_ground(-origin, origin + 1)
+    )[0]
     walls = Walls(np.array([[9.0, -4, 7, 8]]), np.array([[-9.0, 9]]), np.ones(1), np.zeros(1))
     points = look(HDL, Scene(walls, NO_WALLS, NOWHERE), pose)[:, :3] @ pose[:3, :3].T + pose[:3, 3]
     along = np.array([-2.0, 12.0]) / np.hypot(2, 12)

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from rcnn_odom.geometry import planar_to_poses
 from rcnn_odom.simulation.beams import EvenBeams
-from rcnn_odom.simulation.drawing import upright
+from rcnn_odom.simulation.drawing import upright_walls
 from rcnn_odom.simulation.laser import Laser
 from rcnn_odom.simulation.raycast import cast, cast_each
 from rcnn_odom.simulation.scene import NO_WALLS, Material, Scene, Walls, join
@@ -21,7 +21,7 @@ LOW, HIGH = np.array([-4.0, -3.0]), np.array([7.0, 5.0])
 def box_room() -> Scene:
     (x1, y1), (x2, y2) = LOW, HIGH
     ends = np.array([[x1, y1, x2, y1], [x2, y1, x2, y2], [x2, y2, x1, y2], [x1, y2, x1, y1]])
-    return Scene(upright(ends, Material()), NO_WALLS, NOWHERE)
+    return Scene(upright_walls(ends, Material()), NO_WALLS, NOWHERE)
 
 
 def range_in_box(x, y, direction):

@@ -6,7 +6,7 @@ from scipy.interpolate import RegularGridInterpolator
 from scipy.spatial.transform import Rotation
 
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.simulation.terrain import HILLINESS_DEG, Ground, flat_ground, random_ground, stand
+from rcnn_odom.simulation.terrain import HILLINESS_DEG, Ground, flat_ground, place_on_ground, random_ground
 
 CORNER = np.array([-100.0, -100.0])
 LEVEL = np.zeros((1, 2))
@@ -20,7 +20,7 @@ def plane(east: float, north: float) -> Ground:
 
 def rotation(heading: float, tilt: FloatArray = LEVEL, ground: Ground | None = None) -> FloatArray:
     ground = ground or flat_ground(CORNER, -CORNER)
-    return stand(np.array([[3.0, -4.0, heading]]), tilt, 1.73, ground)[0, :3, :3]
+    return place_on_ground(np.array([[3.0, -4.0, heading]]), tilt, 1.73, ground)[0, :3, :3]
 
 
 def test_heights_equal_scipys() -> None:
@@ -87,7 +87,7 @@ def test_laser_rides_at_its_height_above_the_road() -> None:
     rng = np.random.default_rng(4)
     ground = random_ground(CORNER, -CORNER, rng)
     planar = np.column_stack([rng.uniform(-80, 80, (50, 2)), rng.uniform(-4, 4, 50)])
-    poses = stand(planar, rng.normal(0, 0.02, (50, 2)), 1.8, ground)
+    poses = place_on_ground(planar, rng.normal(0, 0.02, (50, 2)), 1.8, ground)
     np.testing.assert_array_equal(poses[:, :2, 3], planar[:, :2])
     np.testing.assert_allclose(poses[:, 2, 3] - ground.at(planar[:, :2]), 1.8, atol=1e-12)
     np.testing.assert_allclose(

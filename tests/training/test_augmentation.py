@@ -12,7 +12,7 @@ from rcnn_odom.geometry import advance, planar_to_poses, poses_to_planar, relati
 from rcnn_odom.models.encoding import Sensor, decode, encode
 from rcnn_odom.simulation import worlds
 from rcnn_odom.simulation.laser import Laser
-from rcnn_odom.training.augmentation import LEAST_SEEN, Augmentation, moved_steps
+from rcnn_odom.training.augmentation import MIN_VISIBLE_SHARE, Augmentation, moved_steps
 from rcnn_odom.training.windows import Windows, WindowSampler, turn_scan
 from training.test_datamodule import FULL, HALF, MIRRORED_WALLS, WALLS, encoded, look, random_planar, wrap
 
@@ -167,7 +167,7 @@ def test_a_move_of_which_too_little_is_left_is_made_smaller():
     turned = []
     for seed in range(60):
         pairs, steps = window_of(drive, HALF, 1, seed, move=[0.0, 0.0, 90.0])
-        assert np.count_nonzero(pairs[0, 1]) >= LEAST_SEEN * before
+        assert np.count_nonzero(pairs[0, 1]) >= MIN_VISIBLE_SHARE * before
         assert_sees(pairs[0, 1], look(advance(pose, steps[0]), HALF))
         turned.append(abs(np.rad2deg(steps[0, 2])))
     assert 100 < max(turned) < 150

@@ -90,7 +90,8 @@ def test_the_average_is_validated_and_kept_while_training_goes_on_without_it(
     for epoch, (weights, expected) in enumerate(zip(watch.in_validation, averages, strict=True)):
         assert_close(weights, expected)
         assert differ(weights, watch.after_step[STEPS * epoch + STEPS - 1]), "the test shows nothing"
-    drifts = [value for _, value in result_of(tmp_path / "outputs" / "run")[2]["val/drift"]]
+    curves = result_of(tmp_path / "outputs" / "run")[2]
+    drifts = [value for _, value in curves["Validation: after each epoch/drift in %, all drives"]]
     best = {name: value.numpy() for name, value in best_of(tmp_path / "outputs" / "run").items()}
     assert_close(best, averages[int(np.argmin(drifts))])
 
@@ -201,10 +202,10 @@ def test_processes_whose_time_is_up_go_on_bit_for_bit(configure, kitti, tmp_path
 
 
 def test_a_killed_training_goes_on_by_its_fingerprint(configure, kitti, tmp_path, monkeypatch):
-    monkeypatch.setattr(saving, "EVERY", -1.0)
+    monkeypatch.setattr(saving, "SAVE_EVERY_SECONDS", -1.0)
     options = ["model=cnn_cls", *kitti]
     kill_after(monkeypatch, 3, lambda: train(configure(*options, AVERAGED)))
-    with pytest.raises(InputError, match="begun with other settings"):
+    with pytest.raises(InputError, match="started with other settings"):
         train(configure(*options, "model.averaging=0.8"))
     settings = {value: plain(configure(*options, f"model.averaging={value}")) for value in (0.0, 0.7, 0.8)}
     data = stages.build_datamodule(settings[0.0]).load(("train", "val"))

@@ -11,7 +11,7 @@ import torch
 
 from rcnn_odom.models.rcnn import RCNNRegression
 from rcnn_odom.training import bench, bench_train
-from rcnn_odom.training.bench import Way
+from rcnn_odom.training.bench import Implementation
 
 
 @pytest.mark.slow
@@ -41,7 +41,9 @@ def test_ratios_are_those_of_the_medians():
     times = {"read fp32 weights": 9.0, "read int8 weights": 2.0, "convolutions": 1.0, "eager nn.LSTM": 150.0}
     times |= {"onnx fp32": 13.0, "onnx int8": 4.5, "all_round": 0.8, "half_circle": 0.7}
     times |= {"around the network": 0.1, "matcher": 0.9, "kiss_icp": 1.8}
-    ways = {name: Way(lambda frame: None, times=[value, value, 50.0]) for name, value in times.items()}
+    ways = {
+        name: Implementation(lambda frame: None, times=[value, value, 50.0]) for name, value in times.items()
+    }
     rows = {
         line[:30].strip(): line[30:].split()[0]
         for line in bench.report(ways, bench.build(RCNNRegression)).splitlines()
@@ -59,7 +61,7 @@ def test_the_eager_network_is_the_same_network():
     """What is slower computes the same: with its weights copied, ``nn.LSTM`` gives the same motions."""
     network = bench.build(RCNNRegression, hidden=16)
     depths = np.random.default_rng(0).uniform(0, 70, (6, 3601)).astype(np.float32)
-    step = bench.eager(network, depths)
+    step = bench.run_eager_lstm(network, depths)
     with torch.inference_mode():
         got = [step(frame).motion.flatten().numpy() for frame in range(1, 6)]
         pairs = torch.from_numpy(np.stack([depths[:-1], depths[1:]], axis=1))[None]
@@ -81,7 +83,7 @@ def resident():
 network = bench.build(RCNNRegression, hidden=512)
 scans = [Scan(np.full(1800, 5.0), np.linspace(-3, 3, 1800))] * 2
 indoors = [Scan(np.full(181, 5.0), np.linspace(-1.5, 1.5, 181))] * 2
-ways = bench.build_ways(network, scans, indoors)
+ways = bench.build_implementations(network, scans, indoors)
 for way in ways.values():
     way.step(1)
 before = resident()

@@ -85,7 +85,7 @@ def test_a_network_has_a_row_on_the_sets_of_its_laser(
     [
         ("nobody", [], "no model is called nobody; there are"),
         ("karto", ["benchmark.only=[roof]"], "no set of benchmark.sets is called roof; there are indoor"),
-        ("cnn_reg", [], "benchmark.method=cnn_reg: a network is measured as trained; give its run"),
+        ("cnn_reg", [], "benchmark.method=cnn_reg: this network needs training; give a run"),
         ("karto", ["+benchmark.options.cell=1"], "benchmark.options.cell: there is no such option"),
         ("karto", ["+benchmark.options.voxel=0"], "benchmark.options.voxel=0: must be a number above 0"),
         (

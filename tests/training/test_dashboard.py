@@ -21,6 +21,8 @@ from data.make_kitti import make_kitti
 from train import train
 
 KERNELS = [3, 5]
+TEST_DRIFT = "Best checkpoint: drift/test drift in %, all drives"
+VALIDATION_DRIFT = "Best checkpoint: drift/validation drift in %, all drives"
 PATIENCE = 60  # seconds until a page must have come
 
 
@@ -113,9 +115,9 @@ def test_the_row_of_a_run_has_its_settings_and_drift(sweep, scores):
         assert row["model"].string_value == "cnn_reg"
         assert row["data"].string_value == "kitti"
         assert not any(name.startswith(("run_dir", "outputs", "data.root")) for name in row)
-        for tag, split in (("drift/test", "test"), ("drift/validation", "val")):
+        for tag, split in ((TEST_DRIFT, "test"), (VALIDATION_DRIFT, "val")):
             (event,) = events.Scalars(tag)
-            assert event.value == pytest.approx(scores[kernel][split]["drift"], rel=1e-6)
+            assert event.value == pytest.approx(100 * scores[kernel][split]["drift"], rel=1e-6)
         found.add(kernel)
     assert found == set(KERNELS)
 
@@ -166,7 +168,7 @@ def test_the_server_finds_the_setting_that_differs(tensorboard):
     assert [column["name"] for column in columns if column.get("differs")] == ["model.kernel_size"]
     assert columns[0]["name"] == "model.kernel_size"
     metrics = {metric["name"]["tag"] for metric in ask_experiment(tensorboard)["metricInfos"]}
-    assert {"drift/test", "drift/test/05", "drift/validation"} <= metrics
+    assert {TEST_DRIFT, TEST_DRIFT.replace("all drives", "drive 05"), VALIDATION_DRIFT} <= metrics
 
 
 # --- a real browser ------------------------------------------------------------------------------
@@ -180,6 +182,11 @@ const text = node => node.nodeType === Node.TEXT_NODE ? [node.textContent.trim()
   : [...(node.shadowRoot ? text(node.shadowRoot) : []), ...[...node.childNodes].flatMap(text)];
 """
 LINES = f"{DEEP} return text(document.body).filter(line => line);"
+# Points that each chart has drawn.
+DRAWN = f"""{DEEP}
+const drawn = card => all(card.shadowRoot, 'path.symbol').filter(point => point.getAttribute('d'));
+return all(document, 'tf-custom-scalar-multi-line-chart-card').map(card => drawn(card).length);
+"""
 IMAGE_WIDTHS = f"{DEEP} return all(document, 'img').map(image => image.naturalWidth);"
 # The grid puts the content of its cells elsewhere in the page, in no order: a cell has a slot for it.
 TABLE = f"""{DEEP}
@@ -234,9 +241,9 @@ def test_the_table_of_the_hparams_tab_has_swept_values_and_drift(open_tab, score
     shown = {}
     for row in rows:
         values = dict(zip(header, row, strict=True))
-        shown[float(values["model.kernel_size"])] = float(values["drift/test"])
+        shown[float(values["model.kernel_size"])] = float(values[TEST_DRIFT])
     # Five digits are shown.
-    assert shown == {k: pytest.approx(s["test"]["drift"], rel=1e-4) for k, s in scores.items()}
+    assert shown == {k: pytest.approx(100 * s["test"]["drift"], rel=1e-4) for k, s in scores.items()}
 
 
 @pytest.mark.slow
@@ -254,6 +261,22 @@ def test_the_custom_scalars_have_groups_and_lines(open_tab, sweep):
 
 @pytest.mark.slow
 def test_the_scalars_and_the_figures_are_shown(open_tab):
-    open_tab("scalars", LINES, lambda lines: {"train", "val", "drift/test", "drift/test/05"} <= set(lines))
-    # Trajectory, motions and coverage of each run, loaded to their pixels.
-    open_tab("images", IMAGE_WIDTHS, lambda widths: len(widths) == 3 * len(KERNELS) and min(widths) > 300)
+    groups = {"Best checkpoint: drift", "Training: mean of each epoch", "Validation: after each epoch"}
+    open_tab("scalars", LINES, lambda lines: groups | {TEST_DRIFT} <= set(lines))
+    # Trajectory, motions, coverage and drift by length of each run, loaded to their pixels.
+    open_tab("images", IMAGE_WIDTHS, lambda widths: len(widths) == 4 * len(KERNELS) and min(widths) > 300)
+
+
+@pytest.mark.slow
+def test_the_curves_of_the_custom_scalars_are_drawn(open_tab, sweep):
+    # A name with parentheses has a match and a chart, but no line.
+    charts = len(patterns_of(events_of(next(sweep.glob("*/tensorboard")).parent)))
+    open_tab("custom_scalars", DRAWN, lambda counts: len(counts) == charts and min(counts) >= len(KERNELS))
+
+
+@pytest.mark.slow
+def test_the_text_cards_are_shown(open_tab):
+    command = "python train.py model=cnn_reg "
+    cards = {"What this run is", "How good the best checkpoint is", "Test drift in % by drive", "mean_motion"}
+    lines = open_tab("text", LINES, lambda lines: cards <= set(lines))
+    assert any(line.startswith(command) for line in lines)

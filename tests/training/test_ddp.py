@@ -73,9 +73,11 @@ def test_two_processes_score_as_one_and_log_once(configure, uneven, tmp_path, ca
 
     events = EventAccumulator(str(run / "tensorboard"), {"scalars": 0})
     events.Reload()
-    for tag in ("val/drift", "val/drift/09", "train/loss_epoch"):
+    drift = "Validation: after each epoch/drift in %, all drives"
+    for tag in (drift, drift.replace("all drives", "drive 09"), "Training: mean of each epoch/loss"):
         assert len(events.Scalars(tag)) == 3, tag
-    assert min(point.value for point in events.Scalars("val/drift")) == pytest.approx(metrics["val"]["drift"])
+    best = min(point.value for point in events.Scalars(drift))
+    assert best == pytest.approx(100 * metrics["val"]["drift"])
 
 
 @pytest.mark.slow
@@ -120,7 +122,7 @@ def test_processes_share_every_batch(start):
     def batches(*place):
         sampler = WindowSampler([40, 30], 4, False, seed=1)
         chosen = Batches(sampler, 4, *place)
-        chosen.go_on_after(start)
+        chosen.skip_batches(start)
         return list(chosen)
 
     first, second, whole = batches(0, 2), batches(1, 2), batches()
@@ -169,7 +171,7 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
         process.terminate()
     rest = process.stdout.read()
     assert process.wait(timeout=60) == 130, rest
-    assert "the same command goes on" in rest
+    assert "the same command continues" in rest
     assert "Traceback" not in rest
     step = saved(tmp_path / "stopped", LAST)["global_step"]
     if everyone:  # what follows is the same

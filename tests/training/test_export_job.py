@@ -36,7 +36,7 @@ def run(configure, kitti, tmp_path, trained):
 
 @pytest.mark.slow
 def test_export_prints_the_drift_of_each_precision(run, capsys, monkeypatch):
-    monkeypatch.setattr(export_job, "ALLOWED", 1.0)  # two epochs on 60 frames: int8 may cost anything
+    monkeypatch.setattr(export_job, "MAX_ADDED_DRIFT", 1.0)  # two epochs on 60 frames: int8 may cost anything
     expected = json.loads((run / METRICS).read_text())["test"]["drift"]
     capsys.readouterr()
     assert main(["export", str(run / BEST), "--format", "onnx", "--quantize", "int8"]) == 0
@@ -58,7 +58,7 @@ def test_export_prints_the_drift_of_each_precision(run, capsys, monkeypatch):
 
 @pytest.mark.slow
 def test_a_precision_that_costs_too_much_is_not_written(run, capsys, monkeypatch):
-    monkeypatch.setattr(export_job, "ALLOWED", -1.0)
+    monkeypatch.setattr(export_job, "MAX_ADDED_DRIFT", -1.0)
     assert main(["export", str(run), "--quantize", "int8"]) == 1
     assert "percentage points of drift, more than -100, and is not written" in capsys.readouterr().err
     assert not list(run.glob("*.onnx"))
@@ -106,7 +106,7 @@ def test_other_drives_to_fit_the_uncertainty_on(run, capsys):
     before, pair = (run / BEST).read_bytes(), random_scans(2, bins=361)
     assert main(["export", str(run), "--out", str(run / "own.onnx")]) == 0
     assert main(["export", str(run), "--fit-on", "10[:0.5]"]) == 0
-    assert "truth within so many deviations, %" in capsys.readouterr().out
+    assert "errors within 1 or 2 deviations, %" in capsys.readouterr().out
     own, other = (OnnxStepper(run / name)(pair) for name in ("own.onnx", "model.onnx"))
     np.testing.assert_array_equal(own.array(), other.array())
     assert (np.diagonal(own.covariance) != np.diagonal(other.covariance)).all()
@@ -115,7 +115,7 @@ def test_other_drives_to_fit_the_uncertainty_on(run, capsys):
 
 def test_a_refused_export_leaves_the_checkpoint_as_well(run, capsys, monkeypatch):
     before = (run / BEST).read_bytes()
-    monkeypatch.setattr(export_job, "ALLOWED", -1.0)
+    monkeypatch.setattr(export_job, "MAX_ADDED_DRIFT", -1.0)
     assert main(["export", str(run), "--fit-on", "10[:0.5]"]) == 1
     assert "is not written" in capsys.readouterr().err
     assert (run / BEST).read_bytes() == before

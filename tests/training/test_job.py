@@ -91,7 +91,7 @@ def test_a_mistake_is_told_and_remembered(hydra, caplog):
     assert job.run_job(raising(InputError("model.beta=0")), hydra()) is None
     assert job.run_job(raising(OSError(errno.ENOSPC, "full")), hydra()) is None
     assert "error: model.beta=0" in caplog.text
-    assert "full; make room, and the same command goes on" in caplog.text
+    assert "full; make room, then repeat the command" in caplog.text
     assert job.run_command(lambda: None) == 1
 
 
@@ -104,7 +104,7 @@ def test_in_a_sweep_a_mistake_is_also_written_down_and_raised(hydra, tmp_path):
 
 
 def test_options_of_a_sweep_and_of_a_run_are_not_for_the_other(hydra, caplog):
-    with pytest.raises(InputError, match="run_dir= is one run's"):
+    with pytest.raises(InputError, match="run_dir= is the folder of a single run"):
         job.run_job(lambda cfg: 5, hydra(number=0, overrides=["run_dir=here"]))
     assert job.run_job(lambda cfg: 5, hydra(sweeps="table2")) is None
     assert "+sweeps= needs -m" in caplog.text
@@ -124,7 +124,7 @@ def test_faults_of_the_program_and_stops_go_on(hydra):
     ("traceback", "expected", "message"),
     [
         ("Traceback\nrcnn_odom.errors.InputError: 00: cut off", InputError, "^00: cut off$"),
-        ("Traceback\nOSError: no space", InputError, "^no space; make room, and the same command goes on$"),
+        ("Traceback\nOSError: no space", InputError, "^no space; make room, then repeat the command$"),
         ("Traceback\nrcnn_odom.training.saving.Stopped", Stopped, "^$"),
         ("Traceback\nKeyError: 'fault'", ProcessRaisedException, "fault"),
     ],
@@ -162,6 +162,6 @@ def test_a_signal_is_passed_on_once(monkeypatch):
 def test_paths_are_relative_to_where_the_command_was_started(hydra, caplog):
     assert job.run_job(lambda cfg: 5, hydra(chdir=True)) is None
     assert (
-        "hydra.job.chdir=true: paths are relative to where the command was started; leave it out"
+        "hydra.job.chdir=true: paths must be relative to the folder of the command; leave it out"
         in caplog.text
     )

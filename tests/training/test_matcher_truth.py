@@ -79,7 +79,7 @@ def test_the_path_is_computed_once(folder, tmp_path, monkeypatch, caplog):
     (kept,) = (tmp_path / "cache").glob("*.npz")
     kept.write_bytes(kept.read_bytes()[:-100])
     np.testing.assert_array_equal(truth("log_mcap").poses, first.poses)
-    assert "damaged, matching its scans again" in caplog.text
+    assert "damaged, matching the scans again" in caplog.text
     monkeypatch.setattr(matcher_truth, "hash_statements", lambda sources: "another matcher")
     truth("log_mcap")
     assert len(list((tmp_path / "cache").glob("*.npz"))) == 2

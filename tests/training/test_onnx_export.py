@@ -15,7 +15,7 @@ from rcnn_odom.geometry import Step, advance
 from rcnn_odom.models.encoding import Sensor, encode
 from rcnn_odom.models.onnx_stepper import OnnxStepper
 from rcnn_odom.models.trained import TorchStepper, TrainedModel
-from rcnn_odom.training.onnx_graph import check, to_onnx, write, write_metadata
+from rcnn_odom.training.onnx_graph import compare_with_model, to_onnx, write, write_metadata
 
 
 def steps(stepper, scans):
@@ -42,7 +42,7 @@ def exported(tmp_path_factory):
 def test_streamed_steps_equal_the_checkpoints(variant, projection, precision):
     model = build(variant, projection)
     stepper = OnnxStepper(to_onnx(model, precision).SerializeToString())
-    check(stepper, model)
+    compare_with_model(stepper, model)
     scans = random_scans(30)
     expected = steps(TorchStepper(model), scans)
     # Eight bits leave errors of a few hundredths of what the outputs vary by.
@@ -154,7 +154,7 @@ def test_an_unknown_deviation_across_the_step_leaves_that_of_the_heading():
     model.typical_step[1] = np.nan
     graph = to_onnx(model, "fp32")
     stepper = OnnxStepper(graph.SerializeToString())
-    check(stepper, model)
+    compare_with_model(stepper, model)
     assert json.loads({p.key: p.value for p in graph.metadata_props}["rcnn_odom"])["typical_step"][1] is None
     stepper.reset()
     covariance = stepper(random_scans(2)).covariance
@@ -197,7 +197,7 @@ def test_a_model_of_a_plugin_is_exported_as_any_other(precision):
     assert [value.name for value in graph.graph.input] == ["scans", "sum", "last"]
     assert [value.name for value in graph.graph.output] == ["step", "covariance", "sum_out", "last_out"]
     stepper = OnnxStepper(graph.SerializeToString())
-    check(stepper, model)
+    compare_with_model(stepper, model)
     scans = random_scans(10)
     tolerance = {"fp32": 1e-5, "int8": 0.02}[precision]
     np.testing.assert_allclose(steps(stepper, scans), steps(TorchStepper(model), scans), atol=tolerance)
@@ -212,7 +212,7 @@ def test_a_graph_that_does_something_else_is_noticed():
     with pytest.raises(
         InputError, match=r"the fp32 graph differs from its checkpoint by .* it is not written"
     ):
-        check(OnnxStepper(graph.SerializeToString()), model)
+        compare_with_model(OnnxStepper(graph.SerializeToString()), model)
 
 
 class FromTheThirdStepOn:
@@ -236,16 +236,16 @@ class FromTheThirdStepOn:
 @pytest.mark.parametrize("wrong", [(np.nan, 0.0), (0.0, np.nan), (0.0, -7.0), (0.1, 0.0)])
 def test_wrong_later_steps_and_covariances_are_noticed(wrong):
     model = build()
-    check(FromTheThirdStepOn(model, 0.0, 0.0), model)
+    compare_with_model(FromTheThirdStepOn(model, 0.0, 0.0), model)
     with pytest.raises(InputError, match="differs from its checkpoint"):
-        check(FromTheThirdStepOn(model, *wrong), model)
+        compare_with_model(FromTheThirdStepOn(model, *wrong), model)
 
 
 def test_a_model_that_estimates_nan_is_noticed():
     model = build()
     model.head.distance.bias.data.fill_(np.nan)
     with pytest.raises(InputError, match="differs from its checkpoint"):
-        check(FromTheThirdStepOn(model, 0.0, 0.0), model)
+        compare_with_model(FromTheThirdStepOn(model, 0.0, 0.0), model)
 
 
 def change_metadata(exported, folder, **changes):

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from conftest import ROOT
 from rcnn_odom.errors import InputError
-from rcnn_odom.training.overrides import explain, quoted, read_paths, written
+from rcnn_odom.training.overrides import explain_override, quote_for_hydra, read_paths, written
 from rcnn_odom.training.settings import plain
 
 PATHS = [
@@ -47,20 +47,20 @@ def advised(sentence):
 @pytest.mark.parametrize("name", ["data.root", "run", "outputs", "+model.pretrained"])
 @pytest.mark.parametrize("path", PATHS)
 def test_hydra_reads_what_is_advised(name, path):
-    sentence = explain(f"{name}={path}")
+    sentence = explain_override(f"{name}={path}")
     assert sentence.startswith(f"{name}={path}: Hydra cannot read ")
     assert parse(advised(sentence)).value() == path
 
 
 def test_the_sentence_names_the_character_and_how_to_write_it():
-    assert explain("data.root=~/x") == (
+    assert explain_override("data.root=~/x") == (
         "data.root=~/x: Hydra cannot read '~' in a value without quotes; write 'data.root=\"~/x\"'"
     )
 
 
 @given(st.text(st.sampled_from("ab~ü =,(){}[]'\"\\#:$%/1_."), min_size=1))
 def test_whatever_is_quoted_is_read_as_it_was(path):
-    assert str(parse(f"data.root={quoted(path)}").value()) == path
+    assert str(parse(f"data.root={quote_for_hydra(path)}").value()) == path
     assert str(parse(shlex.split(written("data.root", path))[0]).value()) == path
 
 
@@ -71,9 +71,11 @@ def test_what_hydra_reads_stays_as_it_is(path):
 
 
 def test_names_in_a_list():
-    assert parse(advised(explain("data.train=[ü,00[0.5:]]"))).value() == ["ü", "00[0.5:]"]
-    assert "data.train=[a,b]" in explain("data.train=[a(b)")
-    assert explain("kitti") == "kitti: is not an option; write NAME=VALUE, for instance model=cnn_reg"
+    assert parse(advised(explain_override("data.train=[ü,00[0.5:]]"))).value() == ["ü", "00[0.5:]"]
+    assert "data.train=[a,b]" in explain_override("data.train=[a(b)")
+    assert (
+        explain_override("kitti") == "kitti: is not an option; write NAME=VALUE, for instance model=cnn_reg"
+    )
 
 
 def test_the_home_of_the_user(monkeypatch, configure):
@@ -136,7 +138,7 @@ def command(tmp_path, script, *options, **environment):
         ("train.py", "trainer.max_time=00:00:01:00", "write +trainer.max_time=..."),
         ("train.py", "trainer.max_epochs=3", "set model.epochs"),
         ("train.py", "outputs=", "is an empty path"),
-        ("train.py", "hydra.job.chdir=true", "paths are relative to where the command was started"),
+        ("train.py", "hydra.job.chdir=true", "paths must be relative to the folder of the command"),
         ("train.py", "+data.foo=1", "data.foo: there is no such option; there are apply"),
         ("evaluate.py", "run=a(b)", "write 'run=\"a(b)\"'"),
         ("evaluate.py", "data=nope", "data=nope: there is no such choice"),
@@ -163,10 +165,10 @@ def test_a_terminal_that_knows_ascii_alone(tmp_path, environment):
     options += ['data.train=["ä"]', 'data.test=["tést"]', 'outputs="ö ut"', 'run_dir="ö ut/rün"']
     status, printed = command(tmp_path, "train.py", *options, **environment)
     assert status == 0
-    assert "look at it with: tensorboard --logdir '" in printed
+    assert "look at them with: tensorboard --logdir '" in printed
     run = tmp_path / "ö ut" / "rün"
     assert "tést" in (run / "train.log").read_text(encoding="utf-8")
-    assert "all of it is in 'ö ut/rün'" in (run / "train.log").read_text(encoding="utf-8")
+    assert "all results are in 'ö ut/rün'" in (run / "train.log").read_text(encoding="utf-8")
     assert (run / "trajectories" / "tést.txt").exists()
     status, printed = command(tmp_path, "evaluate.py", 'run="ö ut/rün"', 'outputs="ö ut"', **environment)
     assert status == 0

@@ -12,7 +12,7 @@ from rcnn_odom.evaluation.run_folder import BEST, CONFIG, find_weights
 from rcnn_odom.training import stages
 from rcnn_odom.training.checkpoint import load_module, weights_fingerprint
 from rcnn_odom.training.overrides import read_paths
-from rcnn_odom.training.run_state import point_latest, settings_fingerprint, write_config, write_json
+from rcnn_odom.training.run_state import link_latest, settings_fingerprint, write_config, write_json
 from rcnn_odom.training.settings import plain
 from train import train
 
@@ -63,9 +63,9 @@ def test_after_no_training_it_estimates_what_the_given_network_does(
         "path": str(run / BEST),
         "val_drift": pytest.approx(metrics["val"]["drift"]),
     }
-    assert f"going on from the weights of {run / BEST}; validation drift before training:" in caplog.text
+    assert f"starting from the weights of {run / BEST}; validation drift before training:" in caplog.text
     assert "fine-tuning on 48 scans and" in caplog.text
-    assert "too little to learn from (at least 2000 scans and 200 m)" in caplog.text
+    assert "(recommended: 2000 scans and 200 m or more)" in caplog.text
     assert "fine-tuning has not helped" in caplog.text
     assert not (tmp_path / "outputs" / "run" / "first_stage").exists()
 
@@ -73,11 +73,11 @@ def test_after_no_training_it_estimates_what_the_given_network_does(
 def test_outputs_latest_goes_on_bit_for_bit(given, configure, kitti, tmp_path, monkeypatch):
     outputs, run = tmp_path / "outputs", tmp_path / "outputs" / "given"
     shutil.copytree(given("cnn_reg"), run)
-    point_latest(outputs, run)
+    link_latest(outputs, run)
     options = ["model=cnn_reg", *kitti, *ON_OTHER_DRIVES, "model.batch_size=4"]
     whole = train(configure(*options, f"model.pretrained={run / BEST}", run="whole"))
     assert whole["pretrained"]["path"].endswith(f"given/{BEST}")
-    point_latest(outputs, run)
+    link_latest(outputs, run)
 
     def stop(self, trainer, module):
         if trainer.current_epoch == 1:
@@ -174,15 +174,15 @@ def test_a_run_stands_for_its_best_weights(tmp_path):
     outputs = tmp_path / "outputs"
     first, second = outputs / "first", outputs / "second"
     write_run(first)
-    point_latest(outputs, first)
+    link_latest(outputs, first)
     assert find_weights(first) == first / BEST
     assert find_weights(outputs / "latest").resolve() == first / BEST
     assert find_weights(first / BEST) == first / BEST
     assert find_weights(tmp_path / "none.ckpt") == tmp_path / "none.ckpt"
     write_run(second, pretrained=str(first / BEST), finished=False)
-    point_latest(outputs, second)
+    link_latest(outputs, second)
     assert find_weights(outputs / "latest") == first / BEST, "what the unfinished one began with"
-    with pytest.raises(InputError, match="a run that has not finished; let it finish"):
+    with pytest.raises(InputError, match="this run has not finished; let it finish"):
         find_weights(second)
     write_run(second, pretrained=str(first / BEST))
     assert find_weights(outputs / "latest").resolve() == second / BEST
@@ -191,7 +191,7 @@ def test_a_run_stands_for_its_best_weights(tmp_path):
 def test_the_command_line_knows_latest_before_a_sweep_begins(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_run(tmp_path / "outputs" / "run")
-    point_latest(tmp_path / "outputs", tmp_path / "outputs" / "run")
+    link_latest(tmp_path / "outputs", tmp_path / "outputs" / "run")
     (found,) = read_paths(["model.pretrained=outputs/latest"])
     assert found == f'model.pretrained="outputs/run/{BEST}"'
     assert read_paths(["model.pretrained=a.ckpt"]) == ["model.pretrained=a.ckpt"]

@@ -25,9 +25,9 @@ from rcnn_odom.training.run_state import (
     State,
     check_checkpoint,
     code_fingerprint,
-    entered,
     find_stopped,
-    point_latest,
+    link_latest,
+    open_run,
     state_of,
     write_config,
     write_json,
@@ -54,7 +54,7 @@ def finish(run, settings=SETTINGS, fingerprint="settings", code="code"):
 
 def test_a_run_goes_from_new_to_stopped_to_finished(run):
     assert state_of(run, SETTINGS).state is State.NEW
-    with entered(run, SETTINGS):
+    with open_run(run, SETTINGS):
         pass
     assert state_of(run, SETTINGS) == (State.STOPPED, run)
     assert state_of(run, SETTINGS | {"seed": 1}).state is State.OTHER
@@ -65,7 +65,7 @@ def test_a_run_goes_from_new_to_stopped_to_finished(run):
     assert state_of(run, SETTINGS, Fingerprints("settings", "edited")).state is State.FINISHED
     (run / METRICS).write_text("{")
     assert state_of(run, SETTINGS).state is State.OTHER
-    with pytest.raises(InputError, match="holds a finished run"), entered(run, SETTINGS):
+    with pytest.raises(InputError, match="holds a finished run"), open_run(run, SETTINGS):
         pass
 
 
@@ -73,9 +73,9 @@ def test_a_run_of_another_process_is_locked(run):
     write_config(run, SETTINGS)
     with lock_if_free(run / RUNNING):
         assert state_of(run, SETTINGS).state is State.LOCKED
-        with pytest.raises(InputError, match="another process is training this run"), entered(run, SETTINGS):
+        with pytest.raises(InputError, match="another process is training this run"), open_run(run, SETTINGS):
             pass
-    with entered(run, SETTINGS):
+    with open_run(run, SETTINGS):
         assert state_of(run, SETTINGS).state is State.STOPPED, "its own process may look too"
 
 
@@ -86,7 +86,7 @@ def test_a_twin_has_the_same_recordings_settings_and_code(run, tmp_path):
     finish(outputs / "edited", code="other")
     assert state_of(run, SETTINGS, WANTED, twins_in=outputs).state is State.STOPPED
     finish(outputs / "twin")
-    point_latest(outputs, outputs / "twin")
+    link_latest(outputs, outputs / "twin")
     assert state_of(run, SETTINGS, WANTED, twins_in=outputs) == (State.TWIN, outputs / "twin")
     assert state_of(run, SETTINGS, WANTED).state is State.STOPPED
 
@@ -113,12 +113,12 @@ def test_a_stopped_run_is_taken_from_the_look_on(tmp_path, run, monkeypatch):
 FIND = """
 import sys
 from pathlib import Path
-from rcnn_odom.training.run_state import entered, find_stopped
+from rcnn_odom.training.run_state import open_run, find_stopped
 settings = {settings!r}
 found = find_stopped(Path({folder!r}), settings) or Path({folder!r}) / sys.argv[1]
 print(found.name, flush=True)
 sys.stdin.readline()
-with entered(found, settings):
+with open_run(found, settings):
     print("entered", flush=True)
 """
 
@@ -135,7 +135,7 @@ def test_the_second_of_two_equal_commands_gets_a_folder_of_its_own(run):
 
 
 def _hold(run, events):
-    with entered(run, SETTINGS):
+    with open_run(run, SETTINGS):
         events.put("entered")
         events.get()
 
@@ -193,7 +193,7 @@ def test_a_stopped_run_goes_on_with_edited_code_and_says_so(caplog, tmp_path):
     check_checkpoint(tmp_path, {"fingerprint": "settings", "code": "code"}, WANTED)
     assert caplog.text == ""
     check_checkpoint(tmp_path, {"fingerprint": "settings", "code": "before"}, WANTED)
-    assert "the code has changed since this run began" in caplog.text
+    assert "the code has changed since this run was started" in caplog.text
     with pytest.raises(InputError, match="on other recordings or with another version"):
         check_checkpoint(tmp_path, {"fingerprint": "other", "code": "code"}, WANTED)
 
@@ -203,7 +203,7 @@ def test_a_stopped_run_goes_on_with_edited_code_and_says_so(caplog, tmp_path):
 
 def test_latest_as_the_folder_of_a_run_is_the_run_that_it_shows(run, tmp_path):
     write_config(run, {"data": {}, "model": {}, "trainer": {}})
-    point_latest(tmp_path, run)
+    link_latest(tmp_path, run)
     assert home_of(tmp_path / "latest").resolve() == run.resolve()
     assert home_of(run) == run
     assert home_of(tmp_path / "new") == tmp_path / "new"
@@ -216,7 +216,7 @@ def test_latest_shows_the_run_but_tensorboard_sees_it_once(run, tmp_path):
             writer.add_scalar("loss", 1.0, 1)
     (outputs / "latest").symlink_to("before")
     for each in (outputs / "before", run):
-        point_latest(outputs, each)
+        link_latest(outputs, each)
     events = EventMultiplexer()
     events.AddRunsFromDirectory(str(outputs))
     events.Reload()

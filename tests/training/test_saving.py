@@ -65,7 +65,7 @@ def assert_same(one, other):
 
 @pytest.fixture
 def save_at_every_step(monkeypatch):
-    monkeypatch.setattr(saving, "EVERY", -1.0)
+    monkeypatch.setattr(saving, "SAVE_EVERY_SECONDS", -1.0)
 
 
 @pytest.mark.slow
@@ -89,7 +89,7 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
             train(configure(*options, run=run))
         # The validation belongs to the epoch's last step, after which nothing is saved before it.
         saved = step - 1 if step % epoch == 0 else step
-        assert f"going on from {tmp_path}/outputs/{run}/{LAST}, step {saved}\n" in caplog.text
+        assert f"continuing from {tmp_path}/outputs/{run}/{LAST}, step {saved}\n" in caplog.text
         assert_same(result_of(tmp_path / "outputs" / run), whole)
 
 
@@ -133,7 +133,7 @@ def test_killed_before_the_first_checkpoint_it_begins_again_with_clean_curves(
 COMMAND = f"""
 import runpy, sys
 from rcnn_odom.training import saving
-saving.EVERY = 0.25
+saving.SAVE_EVERY_SECONDS = 0.25
 sys.path.insert(0, {str(ROOT)!r})
 sys.argv[0] = {str(ROOT / "train.py")!r}
 runpy.run_path(sys.argv[0], run_name="__main__")
@@ -204,13 +204,13 @@ def test_asked_to_stop_it_saves_and_says_how_to_go_on(command, tmp_path, number)
     rest = process.stdout.read()
     assert process.wait(timeout=60) == 130
     run = only_run(tmp_path / "outputs")
-    assert f"stopped; the same command goes on from what is in {run.relative_to(tmp_path)}" in rest
+    assert f"stopped; the same command continues the run in {run.relative_to(tmp_path)}" in rest
     assert "Traceback" not in rest
     step = torch.load(run / "first_stage" / LAST, weights_only=True)["global_step"]
     assert step >= 2 * 14
     process = command(tmp_path / "outputs", "model.first_stage.epochs=500")
     for line in process.stdout:
-        if line.startswith("going on from"):
+        if line.startswith("continuing from"):
             break
     process.kill()
     process.communicate()

@@ -20,7 +20,7 @@ def test_deskew_is_auto_for_all_data(configure):
 
 
 def test_a_network_sees_scans_as_they_were_taken(configure):
-    says = "data.deskew=on: networks see scans as they were taken; set data.deskew=auto"
+    says = "data.deskew=on: networks use scans without deskewing; set data.deskew=auto"
     for given in (
         configure("data.deskew=on"),
         configure("model=cnn_reg", "data.deskew=true"),

@@ -20,7 +20,7 @@ from rcnn_odom.training import cluster
 from rcnn_odom.training.checkpoint import load_module
 from rcnn_odom.training.cluster import World, find_world
 from rcnn_odom.training.settings import plain
-from rcnn_odom.training.trainer_options import place, processes_per_node
+from rcnn_odom.training.trainer_options import check_devices, processes_per_node
 from train import train
 
 TORCHRUN = {"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1"}
@@ -125,7 +125,7 @@ def test_two_nodes_score_as_one_process_and_log_once(configure, uneven, tmp_path
     run = run_of(tmp_path)
     assert "epoch" not in texts[1]
     for text in (texts[0], (run / "train.log").read_text()):
-        for line in ("epoch  1/2", "epoch  2/2", "encoding 470 scans", "all of it is in"):
+        for line in ("epoch  1/2", "epoch  2/2", "encoding 470 scans", "all results are in"):
             assert text.count(line) == 1, line
         assert len(re.findall(r"^epoch  1/", text, re.MULTILINE)) == (2 if model == "rcnn_reg" else 1)
     assert (tmp_path / "outputs" / "latest" / METRICS).resolve() == run / METRICS
@@ -215,12 +215,14 @@ def test_after_a_kill_both_end_and_the_same_command_goes_on_bit_for_bit(whole, t
     texts, statuses = ends(processes, 60)
     assert statuses[killed] == -signal.SIGKILL
     assert statuses[1 - killed] == 1
-    assert re.search(r"^error: .*has ended; the same command goes on", texts[1 - killed], re.MULTILINE), texts
+    assert re.search(r"^error: .*has ended; the same command continues", texts[1 - killed], re.MULTILINE), (
+        texts
+    )
     assert "Traceback" not in "".join(texts)
     assert (run_of(tmp_path) / LAST).exists()
     texts, statuses = ends(start(tmp_path, options))
     assert statuses == [0, 0], texts
-    assert texts[0].count("going on from") == 1
+    assert texts[0].count("continuing from") == 1
     assert_equal(weights_of(tmp_path), weights)
 
 
@@ -232,7 +234,7 @@ def test_asked_to_stop_one_all_save_and_go_on_bit_for_bit(whole, tmp_path):
     processes[1].terminate()
     texts, statuses = ends(processes, 60)
     assert statuses == [130, 130], texts
-    assert "the same command goes on" in texts[0]
+    assert "the same command continues" in texts[0]
     step = torch.load(run_of(tmp_path) / LAST, weights_only=True)["global_step"]
     texts, statuses = ends(start(tmp_path, options))
     assert statuses == [0, 0], texts
@@ -290,7 +292,7 @@ def test_a_sweep_is_refused(tmp_path, rank):
     command = [str(ROOT / "train.py"), "-m", "model=cnn_reg,cnn_cls", "trainer=ddp"]
     [text], [status] = ends([run(command, tmp_path, as_torchrun(rank, "1"))], 60)
     assert status == 1
-    told = "error: -m: torchrun has started 2 processes, which train one run; start the sweep by python"
+    told = "error: -m: torchrun has started 2 processes for a single run; start the sweep by python"
     assert text.startswith(told) if rank == 0 else text == ""
     assert text.count("\n") == 1 - rank
 
@@ -340,8 +342,8 @@ def test_the_world_is_as_its_variables_say(variables, world):
             without(SLURM, "SLURM_NTASKS_PER_NODE"),
             "not SLURM_NTASKS_PER_NODE; .* srun --ntasks-per-node=N",
         ),
-        (TORCHRUN | {"RANK": "2"}, "RANK=2 WORLD_SIZE=2 .*: these do not fit together"),
-        (TORCHRUN | {"WORLD_SIZE": "two"}, "WORLD_SIZE=two .*: these do not fit together"),
+        (TORCHRUN | {"RANK": "2"}, "RANK=2 WORLD_SIZE=2 .*: these contradict each other"),
+        (TORCHRUN | {"WORLD_SIZE": "two"}, "WORLD_SIZE=two .*: these contradict each other"),
         (TORCHRUN | {"WORLD_SIZE": "3", "LOCAL_WORLD_SIZE": "2"}, "must start as many on every node"),
     ],
 )
@@ -352,7 +354,7 @@ def test_variables_that_do_not_fit_are_refused(variables, message):
 
 def test_devices_and_nodes_are_those_that_were_started(monkeypatch):
     trainer = {"devices": 2, "num_nodes": 1, "strategy": "ddp_spawn"}
-    place(trainer)
+    check_devices(trainer)
     assert trainer == {"devices": 2, "strategy": "ddp_spawn"}
     assert processes_per_node(2) == 2
     for name, value in (SLURM | {"SLURM_NTASKS": "8", "SLURM_NTASKS_PER_NODE": "4"}).items():
@@ -360,20 +362,20 @@ def test_devices_and_nodes_are_those_that_were_started(monkeypatch):
     assert processes_per_node(2) == 4
     for devices in (4, [0, 1, 2, 3]):
         trainer = {"devices": devices, "strategy": "ddp_spawn"}
-        place(trainer)
+        check_devices(trainer)
         assert trainer["num_nodes"] == 2
     with pytest.raises(InputError, match=r"srun has started 8 processes, 4 on each node; set"):
-        place({"devices": 8, "strategy": "ddp_spawn"})
+        check_devices({"devices": 8, "strategy": "ddp_spawn"})
     with pytest.raises(InputError, match=r"devices=4 trainer.num_nodes=3: srun has started 8 processes"):
-        place({"devices": 4, "num_nodes": 3, "strategy": "ddp_spawn"})
+        check_devices({"devices": 4, "num_nodes": 3, "strategy": "ddp_spawn"})
     with pytest.raises(
         InputError, match=r"trainer.strategy=auto: srun has started 8 processes; set trainer=ddp"
     ):
-        place({"devices": 4})
+        check_devices({"devices": 4})
 
 
 def test_a_folder_that_another_node_does_not_see_is_told(monkeypatch, tmp_path):
-    monkeypatch.setattr(cluster, "SEEN_WITHIN", 0.0)
+    monkeypatch.setattr(cluster, "FILE_TIMEOUT", 0.0)
     work = cluster.Work(lambda: None, "fit", None, None, {}, {}, [tmp_path / ".seen-1"])
     with pytest.raises(InputError, match="is not the first process' folder; start all processes in the same"):
         cluster._prepare(work)

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 import torch
 import yaml
+from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from conftest import ROOT
 from rcnn_odom.evaluation.run_folder import BEST, LAST
@@ -81,8 +82,8 @@ def test_a_killed_sweep_goes_on_where_it_was(command, sweep, tmp_path):
     scores = (first / "metrics.json").read_text()
     assert not (second / "metrics.json").exists()
     printed = sweep(*options)
-    assert f"run {first} is finished already" in printed
-    assert f"going on from {second / LAST}" in printed
+    assert f"run {first} is already finished" in printed
+    assert f"continuing from {second / LAST}" in printed
     assert (first / "metrics.json").read_text() == scores
     assert (second / "metrics.json").exists()
     assert expected_folders(tmp_path / "kernel_size") == [first.name, second.name]
@@ -133,7 +134,7 @@ def test_a_failed_job_does_not_end_the_sweep_but_its_status(sweep, tmp_path):
     ("options", "message"),
     [
         (["+sweeps=nothing"], "sweeps=nothing: there is no such choice; there are beta"),
-        (["model.kernel_size=3,5", "run_dir=here"], "run_dir= is one run's"),
+        (["model.kernel_size=3,5", "run_dir=here"], "run_dir= is the folder of a single run"),
     ],
 )
 def test_mistakes_are_told_in_a_line(sweep, options, message):
@@ -165,7 +166,7 @@ def test_a_moved_sweep_is_known_again(sweep, tmp_path):
     sweep(*options, f"hydra.sweep.dir={tmp_path}/here")
     (tmp_path / "here").rename(tmp_path / "there")
     printed = sweep(*options, f"hydra.sweep.dir={tmp_path}/there", f"outputs={tmp_path}/new")
-    assert "is finished already" in printed
+    assert "is already finished" in printed
 
 
 @pytest.mark.slow
@@ -192,7 +193,7 @@ def test_optuna_minimises_validation_drift_and_goes_on(sweep, tmp_path):
     assert set(found["best_params"]) == {"model.beta", "model.learning_rate", "model.dropout", "model.window"}
     # Both trials start from the same CNN, and the same command draws the same trials.
     assert len(list(tmp_path.rglob("first_stage/metrics.json"))) == 1
-    assert sweep(*options).count("is finished already") == 2
+    assert sweep(*options).count("is already finished") == 2
 
 
 @pytest.mark.slow
@@ -213,11 +214,16 @@ def test_the_same_training_is_not_done_twice(configure, kitti, tmp_path, caplog)
     first = train(configure("model=cnn_reg", *kitti), reuse=True)
     assert "same_as" not in first
     second = train(configure("model=cnn_reg", *kitti, run="second"), reuse=True)
-    assert "its weights are taken" in caplog.text
+    assert "its weights are used" in caplog.text
     assert second["same_as"] == str(tmp_path / "outputs" / "run")
     assert second["test"] == first["test"]
     assert second["val"] == first["val"]
     assert (tmp_path / "outputs" / "second" / BEST).exists()
+    events = EventAccumulator(str(tmp_path / "outputs" / "second" / "tensorboard"))
+    events.Reload()
+    (card,) = events.Tensors("About this run")
+    text = card.tensor_proto.string_val[0].decode()
+    assert f"- **Weights:** those of `{tmp_path}/outputs/run`, which has finished the same training" in text
     third = train(configure("model=cnn_reg", *kitti, "seed=1", run="third"), reuse=True)
     assert "same_as" not in third
     # Outside a sweep a user who asks for a training gets one.

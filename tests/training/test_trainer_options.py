@@ -17,7 +17,7 @@ from rcnn_odom.training import saving, stages
 from rcnn_odom.training.modules import OdometryModule
 from rcnn_odom.training.run_state import State, fingerprints, state_of
 from rcnn_odom.training.settings import plain
-from rcnn_odom.training.trainer_options import INSTEAD, TrainerOptions, refusal, seconds_of
+from rcnn_odom.training.trainer_options import INSTEAD, TrainerOptions, explain_refusal, max_time_in_seconds
 from train import train
 
 
@@ -48,8 +48,8 @@ def test_every_option_of_lightning_is_allowed_or_refused_by_name():
 @pytest.mark.parametrize(
     ("option", "message"),
     [
-        ("+trainer.limit_val_batches=1", "validation runs over whole drives after every epoch"),
-        ("+trainer.check_val_every_n_epoch=2", "validation runs over whole drives after every epoch"),
+        ("+trainer.limit_val_batches=1", "validation uses whole drives after every epoch"),
+        ("+trainer.check_val_every_n_epoch=2", "validation uses whole drives after every epoch"),
         ("+trainer.overfit_batches=1", "set data.train"),
         ("+trainer.max_epochs=3", "set model.epochs"),
         ("+trainer.max_steps=3", "set model.epochs"),
@@ -91,8 +91,8 @@ def test_options_of_training_are_refused_where_nothing_is_trained(configure, kit
 
 def test_every_refusal_says_what_to_do():
     for name in (*INSTEAD, "foo"):
-        assert refusal(name).startswith(f"trainer.{name}: ")
-        assert ";" in refusal(name) or "set " in refusal(name)
+        assert explain_refusal(name).startswith(f"trainer.{name}: ")
+        assert ";" in explain_refusal(name) or "set " in explain_refusal(name)
 
 
 @pytest.mark.parametrize(
@@ -190,7 +190,7 @@ def test_the_schedule_ends_with_the_batches_that_are_trained(configure, kitti, s
     ],
 )
 def test_forms_of_a_time(max_time, seconds):
-    assert seconds_of(max_time) == seconds
+    assert max_time_in_seconds(max_time) == seconds
 
 
 def time_out_after(monkeypatch, step):
@@ -210,7 +210,7 @@ def time_out_after(monkeypatch, step):
         start(self, trainer, module)
 
     monkeypatch.setattr(saving.Saving, "on_train_start", on_train_start)
-    monkeypatch.setattr(saving.Saving, "_wish", wish)
+    monkeypatch.setattr(saving.Saving, "_own_request", wish)
 
 
 # Within the first epoch, at its end, within the second one.
@@ -233,7 +233,10 @@ def test_a_training_whose_time_is_up_is_scored_and_goes_on_to_the_same_result(
     assert training["stopped_by"] == "trainer.max_time"
     assert (metrics["val"]["drift"] is None) == (epochs == 0)
     assert metrics["test"]["sequences"]["05"]["frames"] == 60
-    assert f"stopped by trainer.max_time after {epochs} of 2 epochs; the same command goes on" in caplog.text
+    assert (
+        f"stopped by trainer.max_time after {epochs} of 2 epochs; the same command continues it"
+        in caplog.text
+    )
     assert (run / LAST).exists()
     assert (run / BEST).exists()
     assert (
@@ -241,7 +244,7 @@ def test_a_training_whose_time_is_up_is_scored_and_goes_on_to_the_same_result(
         == metrics["test"]["drift"]
     )
     train(configure(*options, "+trainer.max_time=01:00:00:00"))
-    assert f"going on from {run / LAST}, step {step}" in caplog.text
+    assert f"continuing from {run / LAST}, step {step}" in caplog.text
     assert not (run / LAST).exists()
     assert_same(result_of(run), result_of(tmp_path / "outputs" / "whole"))
     assert "stopped_by" not in json.loads((run / "metrics.json").read_text())["training"]
@@ -269,7 +272,7 @@ def test_a_run_whose_time_was_up_is_unfinished_for_everyone(configure, kitti, tm
     found = read_run(run, "run")
     assert (found.status, found.problem) == (
         "unfinished",
-        "stopped by trainer.max_time; the same command goes on",
+        "stopped by trainer.max_time; the same command continues it",
     )
     settings = plain(configure(*options))
     wanted = fingerprints(settings, stages.build_datamodule(settings).load())
@@ -294,8 +297,8 @@ def test_a_second_stage_waits_for_a_whole_first_one(configure, kitti, tmp_path, 
         # Another run does not take what is not whole.
         assert train(configure(*options, run="other")) is None
     run = tmp_path / "outputs" / "run"
-    assert "stopped by trainer.max_time after 0 of 1 epochs; the same command goes on" in caplog.text
-    assert "the first stage is not whole, so that the second one has to wait" in caplog.text
+    assert "stopped by trainer.max_time after 0 of 1 epochs; the same command continues it" in caplog.text
+    assert "the first stage is not finished, so the second one cannot start" in caplog.text
     assert not (run / "metrics.json").exists()
     assert read_run(run, "run").status == "unfinished"
     metrics = train(configure(*options))

@@ -1,4 +1,4 @@
-"""One check, wherever scans meet a sensor's description: do the laser's beams lie where the sensor says?"""
+"""Checks that the beams of a laser lie where the description of a sensor puts them."""
 
 from typing import NamedTuple, Protocol
 
@@ -10,19 +10,19 @@ from rcnn_odom.recordings.laser_scan import has_most_beyond
 from rcnn_odom.recordings.scan import Scan
 
 PATIENCE = 5
-"""So many scans in a row that do not fit are no accident: the laser is another one."""
+"""After this many misfitting scans in a row, the laser is taken to be another one."""
 LEAST_COVERED = 0.9
 """Part of the sensor's field of view that the beams must cover."""
 WIDEST_GAP = 3.0
-"""Beam spacings: a laser whose beams leave no wider gap turns all round."""
+"""Largest gap, in beam spacings, between the beams of a laser that turns all round."""
 CLOSEST, FARTHEST = 0.3, 2.05
-"""Bins between two beams: from 0.5 degrees for bins of 1, to a Velodyne's 0.18 for bins of 0.1."""
+"""Bins between two neighbouring beams. Allows beams of 0.5 degrees in bins of 1, and 0.18 in bins of 0.1."""
 LARGEST_ANGLE = 1e6
-"""Radians; larger numbers are no angles."""
+"""Radians; larger numbers are not angles."""
 FAR = 100.0
-"""Metres: no planar laser has most of its returns from farther away."""
+"""Metres; no planar laser measures most of its returns beyond this range."""
 RESOLUTIONS_DEG = (0.02, 0.05, 0.1, 0.2, 0.25, 0.3, 0.5, 0.6, 1.0, 1.5, 2.0, 3.0, 4.0, 5.0)
-"""What the advice for a sensor chooses from; each divides the circle."""
+"""Resolutions that the advice for a sensor chooses from; each divides the circle."""
 
 
 class Sensor(Protocol):
@@ -30,11 +30,11 @@ class Sensor(Protocol):
 
     @property
     def resolution_deg(self) -> float:
-        """Degrees between the bins."""
+        """Degrees from one bin to the next."""
 
     @property
     def field_of_view_deg(self) -> float:
-        """Degrees that it covers."""
+        """Degrees that the sensor covers."""
 
     @property
     def facing_deg(self) -> float:
@@ -45,9 +45,12 @@ class Beams(NamedTuple):
     """Where the beams of a laser lie, in degrees.
 
     Attributes:
-        first: the clockwise end, counter-clockwise from straight ahead.
-        covered: from there to the other end; 360 for a laser that turns all round.
-        spacing: between neighbours.
+        first: direction of the clockwise end, counted counter-clockwise from straight ahead.
+        covered: angle from the first beam to the last; 360 for a laser that turns all round.
+        spacing: angle between neighbouring beams.
+
+    >>> print(Beams(first=-90.0, covered=180.0, spacing=0.5))
+    from -90 to 90 degrees, one every 0.5
     """
 
     first: float
@@ -56,7 +59,7 @@ class Beams(NamedTuple):
 
     @property
     def middle(self) -> float:
-        """The direction of the middle, in (-180, 180]."""
+        """Direction of the middle of the beams, in (-180, 180]."""
         return _wrap(self.first + self.covered / 2)
 
     def __str__(self) -> str:
@@ -66,16 +69,20 @@ class Beams(NamedTuple):
         return f"from {start:.4g} to {start + self.covered:.4g} degrees, one every {self.spacing:.2g}"
 
     def sensor_options(self) -> str:
-        """The command-line options of a sensor for these beams; empty where none fits them."""
+        """The command-line options of a sensor for these beams; empty if no sensor fits them.
+
+        >>> Beams(-90.0, 180.0, 0.5).sensor_options().split()[:2]
+        ['data.sensor.field_of_view_deg=180', 'data.sensor.resolution_deg=0.5']
+        """
         resolution = min((r for r in RESOLUTIONS_DEG if r > 0.99 * self.spacing), default=RESOLUTIONS_DEG[-1])
         if not CLOSEST * resolution < self.spacing < FARTHEST * resolution:
             return ""
         covered = self.covered
-        if round(covered + self.spacing, 1) % 5 == 0:  # the beam at one end of, say, 180 degrees is left out
+        if round(covered + self.spacing, 1) % 5 == 0:  # some lasers omit the beam at one end of 180 degrees
             covered += self.spacing
         width = min(max(1, round(covered / resolution)) * resolution, 360.0)
         is_aside = width < 360 and abs(self.middle) > max(resolution, self.spacing)
-        # The beams shall lie in the middle of bins, not between two of them.
+        # The beams should lie in the middle of bins, not on the edge between two.
         facing = round(_wrap(self.first + width / 2), 3) if is_aside else 0.0
         return (
             f"data.sensor.field_of_view_deg={width:g} data.sensor.resolution_deg={resolution:g} "
@@ -89,13 +96,19 @@ def _wrap(degrees: float) -> float:
 
 
 def find_beams(bearings: FloatArray) -> Beams:
-    """Where beams lie whose bearings (P,) in radians are given in any order or direction, P >= 2.
+    """Find the extent and the spacing of a laser's beams.
+
+    Args:
+        bearings: (P,) radians, P >= 2, in any order.
 
     Raises:
-        ValueError: the bearings are not finite, all the same, or go round the circle more than once.
+        ValueError: the bearings are not finite, are all the same, or span more than a circle.
+
+    >>> find_beams(np.deg2rad(np.arange(-90.0, 91.0)))
+    Beams(first=270.0, covered=180.0, spacing=1.0)
     """
     if not (np.abs(bearings) < LARGEST_ANGLE).all():
-        raise ValueError("the bearings of its beams are not finite, or wild")
+        raise ValueError("the bearings of its beams are not finite, or too large to be angles")
     degrees = np.rad2deg(bearings)
     extent = float(np.ptp(degrees))
     typical = float(np.median(np.abs(np.diff(degrees))))
@@ -117,15 +130,19 @@ def find_beams(bearings: FloatArray) -> Beams:
 
 
 def compare_beams(beams: Beams, sensor: Sensor, partly: bool = False) -> str:
-    """Why these beams are not the sensor's; empty where they fit.
+    """Compare beams with a sensor.
 
     Args:
-        beams: of a laser.
-        sensor: what it should be like.
-        partly: they may cover only a part of its field of view, and be farther apart than its bins.
+        beams: the beams of a laser.
+        sensor: the sensor that they should fit.
+        partly: whether the beams may cover only a part of the sensor's field of view, and be farther apart
+            than its bins.
+
+    Returns:
+        The reason why the beams do not fit; empty if they do.
     """
     covered, width = beams.covered, sensor.field_of_view_deg
-    # Rounding, and a laser that leaves its last beam out, are no other laser.
+    # Tolerates rounding, and a laser that omits its last beam.
     slack = beams.spacing + sensor.resolution_deg
     fits = partly or covered >= LEAST_COVERED * width - slack
     if width < 360:
@@ -139,12 +156,12 @@ def compare_beams(beams: Beams, sensor: Sensor, partly: bool = False) -> str:
     else:
         low = sensor.facing_deg - width / 2
         wanted = f"from {low:.4g} to {low + width:.4g} degrees"
-    words = "no part of the sensor's" if partly else "the sensor's"
-    return f"its beams lie {beams}, {words} {wanted}, one every {sensor.resolution_deg:g}"
+    relation = "which is no part of the sensor's" if partly else "but the sensor's lie"
+    return f"its beams lie {beams}, {relation} {wanted}, one every {sensor.resolution_deg:g}"
 
 
 def compare_ranges(ranges: FloatArray) -> str:
-    """Why these readings (P,) cannot be metres; empty where they may be."""
+    """The reason why readings (P,) cannot be metres; empty if they can."""
     if not has_most_beyond(ranges, FAR):
         return ""
     median = np.median(ranges[(ranges > 0) & np.isfinite(ranges)])
@@ -154,33 +171,33 @@ def compare_ranges(ranges: FloatArray) -> str:
 class BeamCheck:
     """Compares the scans of one laser with a sensor, scan after scan.
 
-    Scans that list only their returns (``has_all_beams`` is false), and scans without a reading, always fit.
+    Scans that hold only returns (``has_all_beams`` is false), and scans without any return, always fit.
 
     Args:
-        sensor: what the scans are encoded for.
-        partly: their beams may be a part of the sensor's; see :func:`compare_beams`.
+        sensor: the sensor for which the scans are encoded.
+        partly: whether the beams may be a part of the sensor's; see :func:`compare_beams`.
 
     Attributes:
-        fitting, misfitting: scans that did fit, and that did not.
-        in_a_row: scans since the last one that did fit.
-        reason: why the last one did not, in words.
-        beams: of the last scan that told of them.
+        fitting, misfitting: number of scans that fitted, and of scans that did not.
+        in_a_row: number of misfitting scans since the last one that fitted.
+        reason: why the last misfitting scan did not fit.
+        beams: beams of the last scan whose beams could be found.
     """
 
     def __init__(self, sensor: Sensor, partly: bool = False) -> None:
         self.sensor, self.partly = sensor, partly
         self.fitting, self.misfitting, self.in_a_row, self.reason = 0, 0, 0, ""
         self.beams: Beams | None = None
-        self._seen: object = None
+        self._last_geometry: object = None
         self._beam_reason, self._frame = "", ""
 
     @property
     def is_for_good(self) -> bool:
-        """Whether so many scans in a row did not fit that the laser must be another one."""
+        """Whether ``PATIENCE`` scans in a row did not fit, so that the laser must be another one."""
         return self.in_a_row >= PATIENCE
 
     def __call__(self, scan: Scan) -> str:
-        """Why this scan is not one of the sensor's; empty where it fits."""
+        """Check the next scan; returns the reason why it does not fit, empty if it does."""
         if not ((scan.ranges > 0) & np.isfinite(scan.ranges)).any():
             return ""
         reason = self._compare_beams(scan) or compare_ranges(scan.ranges)
@@ -192,33 +209,34 @@ class BeamCheck:
         return reason
 
     def refusal(self, name: str, remedy: str) -> InputError:
-        """The error of a laser that is another one for good.
+        """The error to raise for a laser that does not fit the sensor.
 
         Args:
-            name: of the recording.
-            remedy: what the user can do where the beams are the reason, ``{}`` for the options of a sensor
-                that they fit.
+            name: name of the recording.
+            remedy: advice to the user if the beams are the reason; ``{}`` in it is replaced by the options of
+                a sensor that fits them.
         """
         beams = self.beams if self._beam_reason else None
-        advice = "correct the recording: metres, and radians between its beams"
+        advice = "correct the recording: ranges in metres, angles in radians"
         if beams and (options := beams.sensor_options()):
             advice = remedy.format(options)
         elif beams:
-            advice = f"no sensor has them so far apart, {FARTHEST * RESOLUTIONS_DEG[-1]:.0f} degrees at most"
+            advice = f"no sensor has beams so far apart, {FARTHEST * RESOLUTIONS_DEG[-1]:.0f} degrees at most"
         return InputError(f"{name}: {self.reason}{self._frame}; {advice}")
 
     def _compare_beams(self, scan: Scan) -> str:
+        """The reason why a scan's beams do not fit; compared again only when the scan's geometry changes."""
         if not scan.has_all_beams:
             return ""
         ends = None if scan.bearings is None else (scan.bearings[0], scan.bearings[-1])
-        seen = len(scan.ranges), ends, scan.frame_id
-        if seen != self._seen:
+        geometry = len(scan.ranges), ends, scan.frame_id
+        if geometry != self._last_geometry:
             self._frame = f" (frame {scan.frame_id})" if scan.frame_id else ""
-            self._seen = seen
-            self._beam_reason = self._judge(scan)
+            self._last_geometry = geometry
+            self._beam_reason = self._find_misfit(scan)
         return self._beam_reason
 
-    def _judge(self, scan: Scan) -> str:
+    def _find_misfit(self, scan: Scan) -> str:
         width = self.sensor.field_of_view_deg
         if len(scan.ranges) < 2:
             return "it has a single beam"

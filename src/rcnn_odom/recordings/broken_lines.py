@@ -1,50 +1,56 @@
-"""Lines of a stream that cannot be used: the first few are told one by one, all are counted."""
+"""Counts the unusable lines of a stream, and warns about the first few."""
 
 import logging
 from collections import Counter
 
 log = logging.getLogger(__name__)
 
-TOLD_SINGLY = 3
-"""A file whose every line is wrong in the same way fills no screen."""
+MAX_WARNINGS = 3
+"""Limits the output for a file in which every line has the same fault."""
 
 
 class BrokenLines:
-    """Tells and counts them.
+    """Counts the broken lines of a stream and logs a warning for each of the first ``MAX_WARNINGS``.
 
     Args:
-        name: of the file or source.
-        what: what to call the lines in the counts.
+        name: name of the file or source.
+        what: name of such lines in the counts.
         skipped: the counts of the stream.
-        is_live: tells them at once; those of a file wait for its first good line, since of a file without one
-            the whole is told.
+        is_live: True: warn at once. False: hold the warnings back until the first good line, because a file
+            without any good line is refused as a whole.
 
     Attributes:
-        count: how many there were.
-        first: number and fault of the first one, in words.
+        count: number of broken lines so far.
+        first: line number and fault of the first one.
     """
 
     def __init__(self, name: str, what: str, skipped: Counter[str], *, is_live: bool = False) -> None:
         self.name, self.what, self.skipped = name, what, skipped
         self.count, self.first = 0, ""
-        self._tell_at_once = is_live
+        self._is_warning_at_once = is_live
         self._waiting: list[str] = []
 
     def add(self, number: int, fault: str, reason: object) -> None:
-        """One more: its line number, the kind of fault, and why."""
+        """Count a broken line.
+
+        Args:
+            number: its line number.
+            fault: the kind of fault.
+            reason: why the line is broken.
+        """
         self.count += 1
         self.skipped[self.what] += 1
         if self.count == 1:
             self.first = f"line {number}: {reason}"
-        if self.count <= TOLD_SINGLY:
-            more = ", and so on: more are only counted" if self.count == TOLD_SINGLY else ""
+        if self.count <= MAX_WARNINGS:
+            more = "; further such lines are only counted" if self.count == MAX_WARNINGS else ""
             self._waiting.append(f"{self.name}:{number}: {fault} ({reason}), skipped{more}")
-        if self._tell_at_once:
-            self.tell()
+        if self._is_warning_at_once:
+            self.log_warnings()
 
-    def tell(self) -> None:
-        """There is a good line: from here on the others are told at once."""
-        self._tell_at_once = True
+    def log_warnings(self) -> None:
+        """Log the waiting warnings, and from now on log every warning at once; call it at a good line."""
+        self._is_warning_at_once = True
         for message in self._waiting:
             log.warning("%s", message)
         self._waiting = []

@@ -1,4 +1,4 @@
-"""Encoded scans: computed once in parallel, kept in one file a recording, memory-mapped when read."""
+"""Cache of encoded scans: computed once in parallel, one file for each recording, memory-mapped when read."""
 
 import hashlib
 import json
@@ -25,15 +25,15 @@ from rcnn_odom.recordings.workers import Workers, useful_workers
 log = logging.getLogger(__name__)
 
 ENCODING_VERSION = 2
-"""Raised whenever the same scans would be encoded to other numbers, or be refused."""
+"""Increase it when the same scans would be encoded to other numbers, or refused."""
 CHECKSUM = hashlib.sha256
-"""Of all that goes before it in a file of the cache, which it ends."""
+"""The last bytes of a cache file are this checksum of all bytes before it."""
 DAY = 86400.0
 FITTING_SENSOR = "set {}"
-"""What to do about beams that are not the sensor's; the options of one that fits come in between."""
+"""Advice if beams do not fit the sensor; ``{}`` is replaced by the options of a sensor that fits them."""
 
 Encoded = tuple[npt.NDArray[np.float32], FloatArray]
-"""Depth vectors (n, bins) and poses (n, 4, 4) of some frames of a drive."""
+"""Depth vectors (n, bins) and poses (n, 4, 4) of n frames of a drive."""
 
 
 class Encoder(beams.Sensor, Protocol):
@@ -44,7 +44,7 @@ class Encoder(beams.Sensor, Protocol):
         """Length of a depth vector."""
 
     def as_dict(self) -> dict[str, Any]:
-        """All that the depth vectors depend on: part of the cache's key."""
+        """All options that the depth vectors depend on; they are part of the cache's key."""
 
     def encode(self, scan: Scan) -> npt.NDArray[np.float32]:
         """The depth vector of a scan, (bins,) metres."""
@@ -54,7 +54,7 @@ class Encoding:
     """A task for workers: reads frames of a drive and encodes them.
 
     Args:
-        open_recording: name -> :class:`Recording`, picklable.
+        open_recording: opens a recording by its name; must be picklable.
         encoder: makes the depth vectors.
     """
 
@@ -63,13 +63,14 @@ class Encoding:
         self._opened: dict[str, Recording] = {}
 
     def __call__(self, name: str, start: int, stop: int) -> Encoded:
-        """Frames start..stop-1 of one drive; a scan whose beams are not the sensor's has no returns.
+        """Encode frames start..stop-1 of a drive; a scan whose beams do not fit the sensor gets no returns.
 
         Raises:
-            InputError: a frame cannot be read, or several in a row, or most, are not the sensor's.
+            InputError: a frame cannot be read; or the beams of several frames in a row, or of most frames, do
+                not fit the sensor.
         """
         if name not in self._opened:
-            # One is enough: a worker's pieces of a drive follow each other.
+            # Keeping one recording is enough: a worker gets all its pieces of a drive one after another.
             self._opened = {name: self.open_recording(name)}
         recording = self._opened[name]
         check = beams.BeamCheck(self.encoder, recording.has_partial_laser)
@@ -80,18 +81,18 @@ class Encoding:
                 depth[:] = self.encoder.encode(scan)
             elif check.is_for_good:
                 raise check.refusal(f"{name}: frame {frame}", FITTING_SENSOR)
-        # The last frames of a long recording may be few.
+        # The last piece of a long recording may have too few frames for a verdict.
         if check.misfitting > check.fitting and (start == 0 or stop - start > beams.PATIENCE):
             raise check.refusal(f"{name}: {check.misfitting} of frames {start} to {stop - 1}", FITTING_SENSOR)
         return depths, recording.poses[start:stop]
 
 
 def cache_path(recording: Recording, encoder: Encoder, folder: Path) -> Path:
-    """Where the encoded scans belong: the name holds a hash of everything that changes them."""
+    """Path of a recording's encoded scans; its name holds a hash of everything that they depend on."""
     parts = [ENCODING_VERSION, encoder.as_dict(), recording.fingerprint, len(recording)]
     key = hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
-    plain_name = re.sub(r"[^\w.~-]+", "_", recording.name)
-    return folder / f"{plain_name}-{key}.npy"
+    safe_name = re.sub(r"[^\w.~-]+", "_", recording.name)
+    return folder / f"{safe_name}-{key}.npy"
 
 
 def encode_recordings(
@@ -101,30 +102,33 @@ def encode_recordings(
     workers: int,
     pool: Workers[Encoded] | None = None,
 ) -> list[Drive]:
-    """The recordings with their depth vectors, from the cache or computed into it in parallel.
+    """Get the depth vectors of recordings from the cache; compute those that are missing, in parallel.
 
     Args:
-        recordings: of names that differ.
+        recordings: recordings with different names.
         encoder: makes the depth vectors.
-        folder: of the cache.
-        workers: processes to start where something is missing.
-        pool: processes that run already, whose :class:`Encoding` opens drives by these names; it is used
-            without a progress bar in their place.
+        folder: folder of the cache.
+        workers: number of processes to start if scans must be encoded.
+        pool: running processes to use instead, without a progress bar; their :class:`Encoding` must open
+            drives by the names of the recordings.
+
+    Returns:
+        One drive for each recording, in the same order.
 
     Raises:
-        InputError: a frame cannot be read, or the folder cannot be made or is full.
+        InputError: a frame cannot be read, the folder cannot be made, or the disk is full.
     """
     scans = [open_cached(recording, encoder, folder) for recording in recordings]
     if any(found is None for found in scans):
         _make_folder(folder)
         with one_at_a_time(folder, "encoding", "encoding scans"):
-            # Another process may have been faster.
+            # Another process may have encoded them while this one waited for the lock.
             missing = [one for one, found in zip(recordings, scans, strict=True) if found is None]
             missing = [recording for recording in missing if open_cached(recording, encoder, folder) is None]
             _encode(missing, encoder, folder, workers, pool)
         scans = [open_cached(recording, encoder, folder) for recording in recordings]
     drives = [
-        Drive.of(recording, found, cache_path(recording, encoder, folder).stem)
+        Drive.from_recording(recording, found, cache_path(recording, encoder, folder).stem)
         for recording, found in zip(recordings, scans, strict=True)
         if found is not None
     ]
@@ -133,10 +137,10 @@ def encode_recordings(
 
 
 def open_cached(recording: Recording, encoder: Encoder, folder: Path) -> npt.NDArray[np.float32] | None:
-    """A map of a recording's depth vectors (N, bins) in the cache; None where they are not there.
+    """Memory-map a recording's depth vectors (N, bins) from the cache; None if the cache does not have them.
 
-    The file is read once to compare its checksum: what a failing disk or a stranger has changed is told and
-    not used. Nothing in it is ever run.
+    The file is read once to verify its checksum. A damaged or altered file causes a warning and is not used.
+    No code from the file is ever executed (``allow_pickle=False``).
     """
     path = cache_path(recording, encoder, folder)
     try:
@@ -156,7 +160,7 @@ def open_cached(recording: Recording, encoder: Encoder, folder: Path) -> npt.NDA
 
 
 def _checksum(file: IO[bytes], size: int) -> "hashlib._Hash":
-    """Of as many bytes from the start of a file."""
+    """Checksum of the first ``size`` bytes of a file."""
     file.seek(0)
     checksum = CHECKSUM()
     while size > 0 and (block := file.read(min(size, 1 << 20))):
@@ -200,10 +204,10 @@ def _encode(
 
 
 class _PartialFile:
-    """An array (N, bins) and its checksum on their way to disk, under the final name only when all is there.
+    """Writes an array (N, bins) and its checksum to a temporary file, which is renamed once it is complete.
 
-    A killed run therefore leaves nothing that a later one would believe. It is not a memory map,
-    because on a full disk that kills the process.
+    So a killed run leaves no incomplete file that a later run would use. The file is not memory-mapped,
+    because writing to a memory map on a full disk kills the process.
     """
 
     def __init__(self, path: Path, shape: tuple[int, int]) -> None:
@@ -222,10 +226,14 @@ class _PartialFile:
         return self
 
     def write(self, start: int, scans: npt.NDArray[np.float32]) -> None:
-        """Rows from ``start`` on.
+        """Write rows from ``start`` on.
+
+        Args:
+            start: index of the first row.
+            scans: (n, bins) rows.
 
         Raises:
-            InputError: the disk is full.
+            InputError: the rows cannot be written, for instance because the disk is full.
         """
         self.missing -= len(scans)
         try:

@@ -1,4 +1,4 @@
-"""CARMEN logs of robots with a planar laser: FLASER or ROBOTLASER1 lines, plain or packed."""
+"""Reads CARMEN logs of robots with a planar laser: FLASER or ROBOTLASER1 lines, plain or compressed."""
 
 import hashlib
 import logging
@@ -17,9 +17,9 @@ from rcnn_odom.recordings.carmen_log.front_laser import FrontLaser
 from rcnn_odom.recordings.carmen_log.lines import PARSERS, LaserLine
 from rcnn_odom.recordings.carmen_log.params import check_field_of_view, find_front_laser
 from rcnn_odom.recordings.carmen_log.truth import (
+    describe_truth,
     find_reference,
     laser_on_robot,
-    name_truth,
     read_truth,
     wheel_odometry,
 )
@@ -32,7 +32,7 @@ from rcnn_odom.recordings.text import lines_of, need_text
 log = logging.getLogger(__name__)
 
 READER_VERSION = 3
-"""Raised whenever the same file would give other scans."""
+"""Increase it when the same file would give other scans."""
 
 SUFFIXES = tuple(
     kind + packing for kind in ("", ".log", ".clf") for packing in ("", ".gz", ".bz2", ".xz", ".zst")
@@ -47,26 +47,26 @@ def load(
     field_of_view_deg: float | None = None,
     max_range: float | None = None,
 ) -> Recording:
-    """One CARMEN log, its scans in the order of the file.
+    """Load a CARMEN log, its scans in the order of the file.
 
-    The truth is the laser pose on the line, or that of the reference. Wheel odometry is the line's odom
-    pose; on ROBOTLASER1 lines, whose odometry is the robot's, it is moved to the laser by the offset
-    between robot and laser on the first line, since they are bolted together.
+    The truth is the laser pose of each line, or the pose of the reference. Wheel odometry is the odometry
+    pose of each line. On ROBOTLASER1 lines it is the pose of the robot, which is transformed to the laser by
+    the offset between robot and laser on the first line; the offset is constant.
 
     Args:
         name: the log's file name, with or without .log or .clf and .gz, .bz2, .xz or .zst.
         root: the folder of the log.
         reference: a table (.csv) with ``raw_scan_index, ref_x, ref_y, ref_theta`` for every scan, or a
-            folder that holds ``NAME_dense_ref.csv``. nan there is an unknown truth. ``matcher``: the poses
-            are nan, to be filled in by scan matching.
+            folder that holds ``NAME_dense_ref.csv``. A value of nan means that the truth is unknown.
+            ``matcher``: the poses are nan, to be filled in by scan matching.
         field_of_view_deg: degrees that the beams of FLASER lines cover. None: as the log's PARAM lines say,
-            and 180 where they do not.
-        max_range: metres; readings at or beyond it are counted in the notes as no returns. None: only
-            what is so by itself (not positive, not finite, at the line's own maximum) is counted.
+            or 180 if they do not say it.
+        max_range: metres; the notes count readings at or beyond it as no returns. None: the notes count only
+            readings that are not positive, not finite, or at the line's own maximum range.
 
     Raises:
-        InputError: no file or several, a broken line, a log that contradicts itself, or a reference that is
-            not about these scans.
+        InputError: there is no such file, or several; a line is broken; the log contradicts itself; or the
+            reference does not belong to these scans.
     """
     check_field_of_view(field_of_view_deg)
     path = _find_log(Path(root), name)
@@ -75,11 +75,11 @@ def load(
     other_lasers: Counter[str] = Counter()
     lines = list(_laser_lines(path, front.laser, other_lasers, strict=True))
     wheels = wheel_odometry(lines, laser_on_robot(lines[0]))
-    beams = LogReader.of(lines, wheels)
-    poses, about_truth = _find_truth(lines, name, reference)
+    beams = LogReader.from_lines(lines, wheels)
+    poses, truth_notes = _find_truth(lines, name, reference)
     notes = [*_count_scans(lines, other_lasers), _count_no_returns(beams, max_range)]
     notes += [*_count_doubted(lines), *front.notes, *front.warnings]
-    notes += [*_check_stamps(beams.stamps), *about_truth]
+    notes += [*_check_stamps(beams.stamps), *truth_notes]
     status = path.stat()
     key = f"carmen {READER_VERSION} {path.name} {status.st_size} {status.st_mtime_ns} {front.laser!r}"
     return Recording(
@@ -97,32 +97,32 @@ def load(
 def _find_truth(
     lines: list[LaserLine], name: str, reference: str | Path | None
 ) -> tuple[FloatArray, list[str]]:
-    """Poses (N, 4, 4) of the laser by the log itself or by its reference, and words about them."""
+    """Poses (N, 4, 4) of the laser from the log itself or from its reference, and notes about them."""
     if str(reference) == MATCHER:
         return np.full((len(lines), 4, 4), np.nan), []
     if reference is None:
-        return planar_to_poses([line.laser for line in lines]), name_truth(lines)
+        return planar_to_poses([line.laser for line in lines]), describe_truth(lines)
     return read_truth(find_reference(Path(reference), name), len(lines))
 
 
 def recognises(path: Path) -> bool:
-    """Any file may be a log: nothing but its lines tells."""
+    """Whether the path is a file: only the lines of a file show whether it is a CARMEN log."""
     return path.is_file()
 
 
 def stream(path: Path, field_of_view_deg: float | None = None) -> ScanStream:
-    """The scans of a log, one after the other in the order of the file, whose stamps are not trusted.
+    """Stream the scans of a log in the order of the file; their stamps are not trusted.
 
-    A broken line is skipped and counted; so are lines of other lasers and of another kind than the first.
-    What the whole file says of its laser is found before, so that the scans are those of :func:`load`.
+    Broken lines, lines of other lasers, and lines of another kind than the first one are skipped and counted.
+    The whole file is first searched for parameters of the laser, so the scans equal those of :func:`load`.
 
     Args:
-        path: of the log, plain or packed.
+        path: path of the log, plain or compressed.
         field_of_view_deg: as in :func:`load`.
 
     Raises:
-        InputError: the file is no text, contradicts itself or has no scan, or the field of view is none.
-            Where ``scans`` is read: no line can be used, or the file cannot be read to its end.
+        InputError: the file is empty, is not text or contradicts itself, or the field of view is out of
+            bounds. While ``scans`` is read: no line can be used, or the file cannot be read to its end.
     """
     check_field_of_view(field_of_view_deg)
     _need_log(path)
@@ -132,34 +132,34 @@ def stream(path: Path, field_of_view_deg: float | None = None) -> ScanStream:
     skipped: Counter[str] = Counter()
     lines = _laser_lines(path, front.laser, skipped, strict=False)
     return ScanStream(
-        name=path.name, scans=_scans(lines), has_clock=False, skipped=skipped, notes=tuple(front.notes)
+        name=path.name, scans=_read_scans(lines), has_clock=False, skipped=skipped, notes=tuple(front.notes)
     )
 
 
-def _scans(lines: Iterator[LaserLine]) -> Iterator[Scan]:
+def _read_scans(lines: Iterator[LaserLine]) -> Iterator[Scan]:
     mount = None
     for line in lines:
         mount = laser_on_robot(line) if mount is None else mount
-        yield LogReader.of([line], wheel_odometry([line], mount))(0)
+        yield LogReader.from_lines([line], wheel_odometry([line], mount))(0)
 
 
 def _need_log(path: Path) -> None:
     head = need_text(path)
     if b"\0" in head and b"LASER" not in head:
         raise InputError(
-            f"{path}: holds binary data, no text, so that it is no CARMEN log; give a KITTI sequence, "
+            f"{path}: holds binary data, not text, so it is not a CARMEN log; give a KITTI sequence, "
             "a CARMEN log, a ROS bag or a file of JSON lines"
         )
 
 
 def _laser_lines(path: Path, front: FrontLaser, others: Counter[str], strict: bool) -> Iterator[LaserLine]:
-    """The laser lines in order; counts those of other lasers that are passed over.
+    """Yield the laser lines of a log in order.
 
     Args:
-        path: of the log.
+        path: path of the log.
         front: the laser of FLASER lines.
-        others: what was passed over.
-        strict: broken lines and a second kind of lines are refused, not passed over.
+        others: counts the lines that are skipped, by their kind.
+        strict: True: a broken line and a second kind of laser lines are errors. False: they are skipped.
     """
     first_kind, kinds, broken = None, set(), BrokenLines(str(path), "broken lines", others)
     refusal: InputError | None = None
@@ -177,7 +177,7 @@ def _laser_lines(path: Path, front: FrontLaser, others: Counter[str], strict: bo
                 raise refusal from error
             broken.add(number, f"broken {kind} line", error)
             continue
-        if refusal:  # which waited for a good line, since of a log without one the whole is told
+        if refusal:  # raised only now, because a log without any good line gets an error about the whole file
             raise refusal
         if first_kind not in (None, kind):
             raise InputError(
@@ -185,7 +185,7 @@ def _laser_lines(path: Path, front: FrontLaser, others: Counter[str], strict: bo
                 "keep one kind of them"
             )
         first_kind = kind
-        broken.tell()
+        broken.log_warnings()
         yield line
     if refusal and broken.count == 1:
         raise refusal
@@ -194,7 +194,7 @@ def _laser_lines(path: Path, front: FrontLaser, others: Counter[str], strict: bo
 
 
 def _candidates(path: Path, others: Counter[str]) -> Iterator[tuple[int, str, str]]:
-    """Number, kind and text of the lines that can be read; counts those of other lasers."""
+    """Number, kind and text of the lines of the front laser; counts the lines of other lasers."""
     for number, text in lines_of(path):
         kind = text.split(None, 1)[0] if text.strip() else ""
         if kind in PARSERS:
@@ -207,7 +207,7 @@ def _why_no_scan(path: Path, kinds: str, broken: BrokenLines, others: Counter[st
     if broken.count:
         return (
             f"{path}: none of its {broken.count} {kinds} lines can be used; the first, {broken.first}; "
-            "correct what they say of the laser"
+            "correct what they say about the laser"
         )
     found = f", only {', '.join(sorted(others))}" if others else ""
     return f"{path}: no FLASER or ROBOTLASER1 line in it{found}; convert the log to one of them"
@@ -215,12 +215,19 @@ def _why_no_scan(path: Path, kinds: str, broken: BrokenLines, others: Counter[st
 
 @dataclass(frozen=True, eq=False)
 class LogReader:
-    """Frame index -> all beams of its scan, from memory.
+    """Gives the scan of a frame, all beams included, from memory.
 
-    Readings at or beyond the maximum range that the log says come as infinite: no return.
+    Readings at or beyond the log's maximum range become infinite: no return.
 
-    All readings lie in one array, (sum of P,), because the number of beams may change within a log;
-    those of a frame begin at its offset (N+1,). The laser's poses by the wheels are (N, 3).
+    The number of beams may change within a log, so the readings of all scans are kept in one array.
+
+    Attributes:
+        readings: (sum of P,) metres, the readings of one scan after those of the scan before.
+        offsets: (N+1,) index of the first reading of each scan, and the number of all readings.
+        first_angle, spacing: (N,) radians, direction of the first beam and angle from beam to beam.
+        maximum: (N,) metres, maximum range of the laser.
+        stamps: (N,) seconds.
+        wheels: (N, 3) pose of the laser from wheel odometry: x and y in metres, heading in radians.
     """
 
     readings: FloatArray
@@ -232,8 +239,8 @@ class LogReader:
     wheels: FloatArray
 
     @classmethod
-    def of(cls, lines: list[LaserLine], wheels: FloatArray) -> "LogReader":
-        """The beams of all lines, and the laser's poses by the robot's wheels, (N, 4, 4)."""
+    def from_lines(cls, lines: list[LaserLine], wheels: FloatArray) -> "LogReader":
+        """Collect the beams of all lines, and the laser's poses (N, 4, 4) from wheel odometry."""
         return cls(
             readings=np.concatenate([line.readings for line in lines]),
             offsets=np.cumsum([0, *(len(line.readings) for line in lines)]),
@@ -245,7 +252,7 @@ class LogReader:
         )
 
     def __call__(self, frame: int) -> Scan:
-        """One frame; infinite range: the log itself calls it no return."""
+        """The scan of a frame; an infinite range is a reading at or beyond the log's maximum range."""
         ranges = self.readings[self.offsets[frame] : self.offsets[frame + 1]]
         bearings = self.first_angle[frame] + self.spacing[frame] * np.arange(len(ranges))
         ranges = np.where(ranges >= self.maximum[frame], np.inf, ranges)
@@ -277,13 +284,15 @@ def _count_scans(lines: list[LaserLine], other_lasers: Counter[str]) -> list[str
         notes.append(f"{len(lines) - scans} scans have another number of beams than {usual}")
     if other_lasers:
         counts = ", ".join(f"{count} {kind}" for kind, count in sorted(other_lasers.items()))
-        notes.append(f"lines of other lasers passed over: {counts}")
+        notes.append(f"skipped lines of other lasers: {counts}")
     return notes
 
 
 def _count_doubted(lines: list[LaserLine]) -> list[str]:
     doubted = sum(line.is_maximum_doubted for line in lines)
-    return [f"{doubted} lines' maximum is not believed: most readings lie beyond it"] if doubted else []
+    if not doubted:
+        return []
+    return [f"the maximum range of {doubted} lines is not used: most of their readings lie beyond it"]
 
 
 def _count_no_returns(beams: LogReader, max_range: float | None) -> str:

@@ -1,7 +1,7 @@
-"""One interface for all formats of recordings, those of other packages too.
+"""One interface for all formats of recordings, also those of other packages.
 
-A format is a module. ``load(name, **options) -> Recording`` makes it one to train on; ``recognises(path) ->
-bool`` and ``stream(path, **options) -> ScanStream`` make it one to stream.
+A format is a module. A format for training has ``load(name, **options) -> Recording``. A format for streaming
+has ``recognises(path) -> bool`` and ``stream(path, **options) -> ScanStream``.
 """
 
 import logging
@@ -21,21 +21,27 @@ from rcnn_odom.registry import choose, collect, modules_in
 log = logging.getLogger(__name__)
 
 WHAT, PACKAGE = "recording format", "rcnn_odom.recordings"
-ASKED_LAST = ("carmen", "simulated")
-"""One knows any file; the other streams nothing and takes a second to be imported."""
+TRIED_LAST = ("carmen", "simulated")
+"""``carmen`` recognises any file; ``simulated`` cannot stream and takes a second to import."""
 
-OF_THE_ROBOT = ("base", "odom_topic")
-"""Options of a ``stream`` without which the poses would be others: refused where a format has none."""
+ROBOT_OPTIONS = ("base", "odom_topic")
+"""Options that change the poses; it is an error to give them for a format that does not have them."""
 
 
 def all_formats(only: str | None = None) -> dict[str, ModuleType]:
-    """The formats by their names; imports all of them.
+    """Import all formats.
 
     Args:
-        only: of those of other packages import the one of this name alone.
+        only: name of the only format to import from other packages; None: import all of them.
+
+    Returns:
+        The formats by their names.
 
     Raises:
-        InputError: one that another package adds has the name of another, or lacks a part.
+        InputError: a format of another package has a name that is taken, or lacks a function.
+
+    >>> sorted(all_formats())[:3]
+    ['carmen', 'json_lines', 'kitti']
     """
     modules = {module.__name__.rpartition(".")[2]: module for module in modules_in(PACKAGE)}
     own = {name: module for name, module in modules.items() if {"load", "recognises"} & set(dir(module))}
@@ -54,27 +60,30 @@ def _check(name: str, module: Any) -> None:
 
 
 def find_format(name: str) -> ModuleType:
-    """The format of this name, one to train on.
+    """Find the format of this name; it must be one for training.
 
     Raises:
-        InputError: there is none, or it has no ``load``.
+        InputError: there is no such format, or it has no ``load``.
     """
     found: ModuleType = choose(WHAT, name, all_formats(only=name))
     if not hasattr(found, "load"):
         raise InputError(
-            f"recording format {name} has no load, so that it only streams; choose another data.reader.format"
+            f"recording format {name} has no load, so it can only stream; choose another data.reader.format"
         )
     return found
 
 
 def open_recording(reader: Mapping[str, Any]) -> OpenRecording:
-    """What opens recordings by their names.
+    """Make a function that opens a recording by its name.
 
     Args:
         reader: ``format``, and the options of its ``load``.
 
     Raises:
-        InputError: there is no such format, or it lacks an option or does not take one.
+        InputError: there is no such format, or an option of its ``load`` is missing or unknown.
+
+    >>> open_recording({"format": "simulated", "frames": 2})("any name").poses.shape
+    (2, 4, 4)
     """
     options = dict(reader)
     name = options.pop("format", None)
@@ -89,17 +98,19 @@ def open_recording(reader: Mapping[str, Any]) -> OpenRecording:
 
 
 def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStream:
-    """A recording by what it looks like: KITTI folder, ROS bag, CARMEN log or one of another package.
+    """Open a recording for streaming; its format is found from its content.
 
     Args:
-        path: of it.
+        path: a KITTI folder, a ROS bag, a CARMEN log, a file of JSON lines, or a recording in a format of
+            another package.
         options: ``topic`` of a bag or of rosbridge's messages, ``ring`` of a KITTI drive or of a point cloud,
             ``height`` of a point cloud, ``odom_topic``, ``base`` and ``laser_pose`` of a bag's robot,
-            ``field_of_view_deg`` of a CARMEN log's FLASER lines. None is left out; one that the format does
-            not have is told and left out, or refused where the poses would be others.
+            ``field_of_view_deg`` of a CARMEN log's FLASER lines. Options that are None are ignored. An option
+            that the format does not have is ignored with a warning; one that changes the poses
+            (``ROBOT_OPTIONS``) is an error.
 
     Raises:
-        InputError: nothing of the kind, or it cannot be read.
+        InputError: the path is no recording, it cannot be read, or an option does not fit its format.
     """
     if not path.exists():
         raise InputError(
@@ -107,7 +118,7 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
         )
     if not path.is_file() and not path.is_dir():
         raise InputError(f"{path}: is a pipe or device; give a file, or --live for JSON lines")
-    for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, ASKED_LAST)):
+    for found in chain(collect(WHAT, {}, _check).values(), modules_in(PACKAGE, TRIED_LAST)):
         if hasattr(found, "recognises") and found.recognises(path):
             stream: ScanStream = found.stream(path, **_options_for(found, path, options or {}))
             return stream
@@ -121,12 +132,16 @@ def open_stream(path: Path, options: Mapping[str, Any] | None = None) -> ScanStr
 
 
 def _options_for(found: ModuleType, path: Path, options: Mapping[str, Any]) -> dict[str, Any]:
-    """Those of the options that a format's ``stream`` takes."""
+    """The options that a format's ``stream`` takes.
+
+    Raises:
+        InputError: an option that changes the poses is not among them.
+    """
     given = {name: value for name, value in options.items() if value is not None}
     taken = signature(found.stream).parameters
     for name in sorted(given.keys() - taken.keys()):
         kind = found.__name__.rpartition(".")[2]
-        if name in OF_THE_ROBOT:
+        if name in ROBOT_OPTIONS:
             raise InputError(f"{path}: read as {kind}, which has no option {name}; leave it out")
-        log.warning("%s: read as %s, which has no option %s; it is left out", path, kind, name)
+        log.warning("%s: read as %s, which has no option %s; the option is ignored", path, kind, name)
     return {name: value for name, value in given.items() if name in taken}

@@ -1,4 +1,4 @@
-"""KITTI odometry: one ring of the Velodyne stands for the 2D laser (paper IV-A).
+"""Reads KITTI odometry sequences: one ring of the Velodyne serves as the 2D laser (paper IV-A).
 
 Layout: ``root/sequences/NAME/{velodyne/*.bin,calib.txt,times.txt}`` and ``root/poses/NAME.txt``.
 """
@@ -14,29 +14,29 @@ from rcnn_odom.geometry import FloatArray, change_frame
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.stream import ScanStream
-from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_kitti, read_lines
+from rcnn_odom.recordings.trajectory import is_rotation, parse_numbers, read_kitti, read_lines
 from rcnn_odom.recordings.velodyne_files import VELODYNE, choose_beam, file_key, list_numbered
 
 READER_VERSION = 4
-"""Raised whenever the same files would give other scans. 4: points at the origin are none."""
+"""Increase it when the same files would give other scans. 4: points at the origin are not returns."""
 
 
 def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
-    """One sequence of the KITTI odometry data.
+    """Load a sequence of the KITTI odometry data.
 
-    The truth is that of the laser: the poses on disk are the camera's and are moved with ``Tr``.
-    The range of a return is the horizontal one, hypot(x, y): motion is estimated in the x-y plane, and
-    so a wall keeps its depth whichever ring sees it. (The ring nearest to horizontal is within half a
-    degree of it, where the slant range is the same to 4 parts in 100,000.)
+    The poses on disk are those of the camera; they are transformed to the laser with ``Tr``.
+    The range of a return is the horizontal distance, hypot(x, y), because motion is estimated in the x-y
+    plane: so a wall has the same range in each ring. (The ring nearest to horizontal is within half a degree
+    of it, where the slant range differs by less than 4 parts in 100,000.)
 
     Args:
         name: folder under ``sequences``, for instance ``"05"``.
         root: folder that holds ``sequences`` and ``poses``.
-        ring: which of the lasers, 0 the first in the file. None: the one whose median elevation is
-            nearest to horizontal (see ``velodyne.LEVEL``), one for the whole sequence.
+        ring: number of the laser in the files, counted from 0. None: the one whose median elevation is
+            nearest to horizontal (see ``velodyne.LEVEL``), the same for the whole sequence.
 
     Raises:
-        InputError: a file is missing, cut off or not as the format says.
+        InputError: a file is missing, cut off or not in the expected format.
     """
     root = Path(root)
     folder = root / "sequences" / name
@@ -67,19 +67,19 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is the folder of a sequence."""
+    """Whether the path is the folder of a sequence."""
     return (path / "velodyne").is_dir()
 
 
 def stream(path: Path, ring: int | None = None) -> ScanStream:
-    """The scans of a sequence's folder, one after the other; its truth is not needed.
+    """Stream the scans of a sequence; no ground truth is needed.
 
     Args:
-        path: ``sequences/NAME``.
+        path: folder of the sequence, ``sequences/NAME``.
         ring: as for :func:`load`.
 
     Raises:
-        InputError: a file is missing, cut off or not as the format says.
+        InputError: a file is missing, cut off or not in the expected format.
     """
     scans, _ = _list_scans(path / "velodyne")
     camera_from_laser = read_calibration(path / "calib.txt")
@@ -102,22 +102,25 @@ def stream(path: Path, ring: int | None = None) -> ScanStream:
 
 @dataclass(kw_only=True)
 class Options:
-    """What ``conf/data/kitti.yaml`` sets beside what all recordings have."""
+    """Options of ``conf/data/kitti.yaml`` that are not common to all recordings."""
 
     ring: int | None = option(least=0, wanted="null or a whole number, not negative")
 
 
 def read_calibration(path: str | Path) -> FloatArray:
-    """``Tr`` of a ``calib.txt``: laser to camera, (4, 4).
+    """Read ``Tr`` of a ``calib.txt``: the transform (4, 4) from the laser's frame to the camera's.
 
     Raises:
-        InputError: there is no such file, no ``Tr:`` line in it, or not 12 numbers on the line.
+        InputError: there is no such file, it has no ``Tr:`` line, or the line does not hold 12 numbers with a
+            rotation among them.
     """
     for number, line in enumerate(read_lines(path, "give the odometry data's own"), start=1):
         if line.startswith("Tr:"):
             tr = np.eye(4)
             words = line[3:].split()
-            tr[:3] = np.reshape(numbers(f"{path}:{number}", words, 12, "Tr has 12 finite numbers"), (3, 4))
+            tr[:3] = np.reshape(
+                parse_numbers(f"{path}:{number}", words, 12, "Tr has 12 finite numbers"), (3, 4)
+            )
             if not is_rotation(tr[:3, :3]):
                 raise InputError(f"{path}:{number}: Tr holds no rotation; restore the original file")
             return tr
@@ -125,7 +128,7 @@ def read_calibration(path: str | Path) -> FloatArray:
 
 
 def _list_scans(folder: Path) -> tuple[list[Path], str]:
-    """Paths in the order of frames, all sizes checked, and a key that changes with any of the files."""
+    """Paths in the order of frames, after a check of all sizes, and a key that changes with any file."""
     found = list_numbered(folder, ".bin")
     if not found:
         raise InputError(f"{folder}: no .bin file in it; unpack the odometry data set's velodyne data there")
@@ -149,4 +152,4 @@ def _read_poses(path: Path) -> FloatArray:
 def _read_stamps(path: Path) -> FloatArray:
     lines = enumerate(read_lines(path, "give the time stamps of all scans"), start=1)
     wanted = "a time stamp is 1 finite number"
-    return np.ravel([numbers(f"{path}:{number}", line.split(), 1, wanted) for number, line in lines])
+    return np.ravel([parse_numbers(f"{path}:{number}", line.split(), 1, wanted) for number, line in lines])

@@ -1,4 +1,4 @@
-"""KITTI raw data: a drive's folder, its truth from the GPS/IMU.
+"""Reads drives of the KITTI raw data; the truth comes from the GPS/IMU.
 
 Layout: ``DATE/DRIVE/{velodyne_points/{data/*.bin,timestamps.txt},oxts/data/*.txt}`` and, in ``DATE`` or
 ``DRIVE``, ``calib_velo_to_cam.txt``, ``calib_cam_to_cam.txt`` and ``calib_imu_to_velo.txt``.
@@ -21,7 +21,7 @@ from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Recording
 from rcnn_odom.recordings.stream import ScanStream
-from rcnn_odom.recordings.trajectory import is_rotation, numbers, read_lines
+from rcnn_odom.recordings.trajectory import is_rotation, parse_numbers, read_lines
 from rcnn_odom.recordings.velodyne_files import (
     LONGEST_TURN,
     SHORTEST_TURN,
@@ -34,19 +34,21 @@ from rcnn_odom.recordings.velodyne_files import (
 )
 
 READER_VERSION = 2
-"""Raised whenever the same files would give other scans."""
+"""Increase it when the same files would give other scans."""
 
 VELODYNE_FOLDER = "velodyne_points"
 EARTH_RADIUS = 6378137.0
 """Metres, as in the raw data's development kit."""
 SAME_MOMENT = 0.1
-"""Seconds: a pose that was measured further from its scan belongs to another one."""
+"""Seconds; largest time between a scan and its pose."""
 FASTEST = 100.0
-"""Metres a second: with a place farther away the GPS/IMU was wrong."""
+"""Metres per second; if the poses are faster, the GPS/IMU was wrong."""
 LEAST_STEP, FEWEST_STEPS = 0.2, 5
-"""So many steps of so many metres tell in which direction a car drives."""
+"""The car's direction is checked if at least ``FEWEST_STEPS`` steps are longer than ``LEAST_STEP`` metres."""
 MOST_SIDEWAYS = np.deg2rad(45.0)
+"""Largest median angle between a car's heading and the direction in which it moves."""
 LISTED_DRIVES = 10
+"""Number of drives that a message lists."""
 STAMP = re.compile(r"(\d{4}-\d\d-\d\d[ T]\d\d:\d\d:\d\d)(?:\.(\d{1,9})\d*)?")
 
 T = TypeVar("T")
@@ -54,28 +56,28 @@ T = TypeVar("T")
 
 @dataclass(kw_only=True)
 class Options:
-    """What ``conf/data/kitti_raw.yaml`` sets beside what all recordings have."""
+    """Options of ``conf/data/kitti_raw.yaml`` that are not common to all recordings."""
 
     ring: int | None = option(least=0, wanted="null or a whole number, not negative")
 
 
 def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
-    """One drive of the KITTI raw data.
+    """Load a drive of the KITTI raw data.
 
-    The truth is that of the laser: the poses of the GPS/IMU, laid out flat by the development kit's Mercator
-    projection, are moved with ``calib_imu_to_velo.txt``. Ranges are horizontal, as of the odometry data.
+    The poses of the GPS/IMU are projected to a plane by the Mercator projection of the development kit, and
+    transformed to the laser with ``calib_imu_to_velo.txt``. Ranges are horizontal, as for the odometry data.
 
     Args:
         name: folder of the drive, for instance ``"2011_09_26_drive_0005_sync"``.
-        root: folder that holds it, or the folders of dates that hold drives.
-        ring: which of the lasers, 0 the first in the file. None: the most level one.
+        root: folder that holds the drive, or the folders of the dates.
+        ring: number of the laser in the files, counted from 0. None: the most level one.
 
     Raises:
-        InputError: a file is missing, cut off or not as the format says.
+        InputError: a file is missing, cut off or not in the expected format.
     """
     drive = _find_drive(Path(root), name)
     scans, notes = _list_scans(drive)
-    camera_from_laser, of_camera = _read_camera(drive)
+    camera_from_laser, camera_notes = _read_camera(drive)
     frames = list(scans)
     stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", frames)
     poses = _read_truth(drive, frames, stamps)
@@ -89,34 +91,35 @@ def load(name: str, *, root: str | Path, ring: int | None = None) -> Recording:
         read_scan=reader,
         fingerprint=hashlib.sha256(key.encode()).hexdigest(),
         camera_from_laser=camera_from_laser,
-        notes=(*notes, *of_camera, *chosen),
+        notes=(*notes, *camera_notes, *chosen),
     )
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a drive's folder, its ``velodyne_points`` or their ``data``, or holds drives."""
+    """Whether the path is a drive's folder, its ``velodyne_points`` or their ``data``, or holds drives."""
     return _drive_of(path) is not None or bool(_drives_in(path))
 
 
 def stream(path: Path, ring: int | None = None) -> ScanStream:
-    """The scans of a drive, one after the other; its truth is not needed.
+    """Stream the scans of a drive; no ground truth is needed.
 
     Args:
         path: folder of the drive, or its ``velodyne_points``, or their ``data``.
         ring: as for :func:`load`.
 
     Raises:
-        InputError: a file is missing, cut off or not as the format says; or the folder holds several drives.
+        InputError: a file is missing, cut off or not in the expected format; or the folder only holds drives.
     """
     drive = _drive_of(path)
     if drive is None:
-        raise InputError(f"{path}: holds drives of KITTI raw and is none itself; give one of {_listed(path)}")
+        drives = _list_drives(path)
+        raise InputError(f"{path}: holds KITTI raw drives but is not one itself; give one of {drives}")
     scans, notes = _list_scans(drive)
     if _find_calibration(drive, "calib_velo_to_cam.txt"):
-        camera_from_laser, of_camera = _read_camera(drive)
+        camera_from_laser, camera_notes = _read_camera(drive)
     else:
         camera_from_laser = FORWARD_CAMERA.copy()
-        of_camera = ("no calib_velo_to_cam.txt: trajectories are those of a camera in the laser's place",)
+        camera_notes = ("no calib_velo_to_cam.txt: trajectories are those of a camera in the laser's place",)
     stamps = _read_stamps(drive / VELODYNE_FOLDER / "timestamps.txt", list(scans))
     turns = _read_turns(drive / VELODYNE_FOLDER, list(scans))
     reader, chosen = choose_beam([entry.path for entry in scans.values()], stamps, ring, turns)
@@ -126,12 +129,12 @@ def stream(path: Path, ring: int | None = None) -> ScanStream:
         total=len(scans),
         beams=VELODYNE,
         camera_from_laser=camera_from_laser,
-        notes=(*notes, *of_camera, *chosen),
+        notes=(*notes, *camera_notes, *chosen),
     )
 
 
 def _drive_of(path: Path) -> Path | None:
-    """The folder of the drive to which a path belongs."""
+    """The folder of the drive to which a path belongs; None if it belongs to none."""
     if (path / VELODYNE_FOLDER).is_dir():
         return path
     whole = Path(os.path.abspath(path))
@@ -141,12 +144,13 @@ def _drive_of(path: Path) -> Path | None:
 
 
 def _drives_in(folder: Path) -> list[str]:
-    """The drives of a date's folder, or of the folder of dates, as paths from there."""
+    """The drives in the folder of a date, or in the folder that holds the dates, as relative paths."""
     found = [*folder.glob(f"*/{VELODYNE_FOLDER}"), *folder.glob(f"*_*_*/*/{VELODYNE_FOLDER}")]
     return sorted(str(path.parent.relative_to(folder)) for path in found if path.is_dir())
 
 
-def _listed(folder: Path) -> str:
+def _list_drives(folder: Path) -> str:
+    """The first drives in a folder, for a message."""
     drives = _drives_in(folder)
     more = f" and {len(drives) - LISTED_DRIVES} more" if len(drives) > LISTED_DRIVES else ""
     return ", ".join(drives[:LISTED_DRIVES]) + more
@@ -159,19 +163,19 @@ def _find_drive(root: Path, name: str) -> Path:
     found = [place for place in places if place.is_dir()]
     if not found or _drives_in(found[0]):
         if (root / VELODYNE_FOLDER).is_dir():
-            there = "it is a drive itself: set data.root to the folder above"
-        elif drives := _listed(root):
-            there = f"set data.train, data.val and data.test to some of {drives}"
+            advice = "it is a drive itself: set data.root to the folder above"
+        elif drives := _list_drives(root):
+            advice = f"set data.train, data.val and data.test to some of {drives}"
         else:
-            there = "set data.root to the folder of dates or drives"
-        raise InputError(f"{root}: no drive {name} in it or in a date's folder; {there}")
+            advice = "set data.root to the folder of dates or drives"
+        raise InputError(f"{root}: no drive {name} in it or in a date's folder; {advice}")
     if len(found) > 1 and found[0] != places[0]:
         raise InputError(f"{root}: {found[0]} and {found[1]} are both {name}; name the date's folder too")
     return found[0]
 
 
 def _list_scans(drive: Path) -> tuple[Scans, tuple[str, ...]]:
-    """The files of a drive's scans by frame number, at least one, and words about them."""
+    """The files of a drive's scans by frame number, at least one, and notes about them."""
     folder = drive / VELODYNE_FOLDER / "data"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; unpack the drive's Velodyne data, of its _sync archive")
@@ -189,11 +193,17 @@ def _list_scans(drive: Path) -> tuple[Scans, tuple[str, ...]]:
     return scans or texts, tuple(notes)
 
 
-def _match(path: Path, frames: list[int], found: Mapping[int, T], what: str) -> list[T]:
-    """What belongs to the frames: by their numbers if all are there, or by position if all differ by as much.
+def _match_frames(path: Path, frames: list[int], found: Mapping[int, T], what: str) -> list[T]:
+    """Find what belongs to each frame: by number, or by order if all numbers differ by the same amount.
+
+    Args:
+        path: file or folder of the items, for the error.
+        frames: numbers of the frames.
+        found: items by their numbers.
+        what: name of the items, for the error.
 
     Raises:
-        InputError: it is neither way.
+        InputError: neither way gives one item for each frame.
     """
     if all(frame in found for frame in frames):
         return [found[frame] for frame in frames]
@@ -213,10 +223,10 @@ def _match(path: Path, frames: list[int], found: Mapping[int, T], what: str) -> 
 
 
 def _read_stamps(path: Path, frames: list[int]) -> FloatArray:
-    """Seconds since 1970, as if the clock's were UTC, of the frames."""
+    """Stamps of the frames (N,): seconds since 1970, as if the clock showed UTC."""
     lines = read_lines(path, "unpack the drive again")
     given = {number: line.strip() for number, line in enumerate(lines) if line.strip()}
-    places = _match(path, frames, {number: number for number in given}, "time stamps")
+    places = _match_frames(path, frames, {number: number for number in given}, "time stamps")
     stamps = np.array([_parse_stamp(f"{path}:{number + 1}", given[number]) for number in places])
     same = np.flatnonzero(np.diff(stamps) == 0)
     if len(same) and (stamps % 1 == 0).all():
@@ -229,10 +239,10 @@ def _read_stamps(path: Path, frames: list[int]) -> FloatArray:
 
 
 def _read_turns(folder: Path, frames: list[int]) -> FloatArray | None:
-    """Seconds (N,) that each turn of the laser took; None where it is not told.
+    """Seconds (N,) that each turn of the laser took; None if the files of their start and end are missing.
 
-    A turn begins and ends behind the car; ``timestamps.txt`` has the moment between, when the laser looked
-    ahead and triggered the cameras.
+    A turn begins and ends behind the car. ``timestamps.txt`` holds the time in between at which the laser
+    pointed ahead and triggered the cameras.
     """
     first, last = (folder / f"timestamps_{end}.txt" for end in ("start", "end"))
     if not first.is_file() or not last.is_file():
@@ -254,7 +264,7 @@ def _parse_stamp(where: str, text: str) -> float:
 
 
 def _find_calibration(drive: Path, name: str) -> Path | None:
-    """A file of the date's calibration, in the drive's folder or in that of the date."""
+    """A calibration file, in the drive's folder or in the folder of the date; None if there is none."""
     places = (drive, Path(os.path.abspath(drive)).parent)
     return next((folder / name for folder in places if (folder / name).is_file()), None)
 
@@ -270,7 +280,7 @@ def _need_calibration(drive: Path, name: str) -> Path:
 
 
 def _read_camera(drive: Path) -> tuple[FloatArray, tuple[str, ...]]:
-    """The odometry data's ``Tr``, laser to rectified camera, (4, 4), and words about it."""
+    """Transform (4, 4) from the laser to the rectified camera, as ``Tr`` of the odometry data, and notes."""
     camera_from_laser = _read_transform(_need_calibration(drive, "calib_velo_to_cam.txt"))
     path = _find_calibration(drive, "calib_cam_to_cam.txt")
     if path is None:
@@ -296,23 +306,23 @@ def _read_rotation(path: Path, name: str) -> FloatArray:
 
 
 def _read_values(path: Path, name: str, count: int) -> tuple[str, list[float]]:
-    """The numbers of the line of this name, and where it is."""
+    """File and line number of the line of this name, and the line's numbers."""
     for number, line in enumerate(read_lines(path, "unpack the date's calibration again"), start=1):
         if line.startswith(f"{name}:"):
             where = f"{path}:{number}"
             words = line[len(name) + 1 :].split()
-            return where, numbers(where, words, count, f"{name} has {count} finite numbers")
+            return where, parse_numbers(where, words, count, f"{name} has {count} finite numbers")
     raise InputError(f"{path}: no line starts with '{name}:'; unpack the date's calibration again")
 
 
 def _read_truth(drive: Path, frames: list[int], stamps: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) of the laser, the place of the GPS/IMU at the first scan the origin."""
+    """Poses (N, 4, 4) of the laser; the origin is the position of the GPS/IMU at the first scan."""
     folder = drive / "oxts" / "data"
     if not folder.is_dir():
         raise InputError(f"{folder}: no such folder; the truth is needed, so unpack the drive's oxts data")
     laser_from_imu = _read_transform(_need_calibration(drive, "calib_imu_to_velo.txt"))
     files = {int(path.stem): path for path in folder.glob("*.txt") if path.stem.isdecimal()}
-    chosen = _match(folder, frames, files, "files")
+    chosen = _match_frames(folder, frames, files, "files")
     if (times := folder.parent / "timestamps.txt").is_file():
         taken = _read_stamps(times, [int(path.stem) for path in chosen])
         if (late := float(np.percentile(np.abs(taken - stamps), 95))) > SAME_MOMENT:
@@ -327,9 +337,13 @@ def _read_truth(drive: Path, frames: list[int], stamps: FloatArray) -> FloatArra
 
 
 def _check_speed(places: FloatArray, stamps: FloatArray, files: list[Path]) -> None:
-    """Raises InputError where a place (N, 3) in metres is too far from the one before it."""
+    """Check that no position (N, 3) in metres is too far from the one before it.
+
+    Raises:
+        InputError: the speed between two positions is above ``FASTEST``.
+    """
     distance, period = np.linalg.norm(np.diff(places, axis=0), axis=1), np.diff(stamps)
-    # Clocks jitter: between two frames there is not much less than the usual time.
+    # Stamps jitter, but the true time between two frames is never much shorter than the median.
     least = max(float(np.median(period)), 0.01) if len(period) else 0.0
     for step in np.flatnonzero(distance > FASTEST * np.maximum(period, least)):
         raise InputError(
@@ -339,7 +353,11 @@ def _check_speed(places: FloatArray, stamps: FloatArray, files: list[Path]) -> N
 
 
 def _check_direction(poses: FloatArray, folder: Path) -> None:
-    """Raises InputError where a car with these poses (N, 4, 4) would slide sideways."""
+    """Check that a car with these poses (N, 4, 4) does not move sideways.
+
+    Raises:
+        InputError: the median angle between heading and motion is above ``MOST_SIDEWAYS``.
+    """
     steps = np.diff(poses[:, :2, 3], axis=0)
     length = np.hypot(*steps.T)
     moved = length > LEAST_STEP
@@ -349,24 +367,24 @@ def _check_direction(poses: FloatArray, folder: Path) -> None:
     aside = np.arccos(np.clip(np.median(along), 0.0, 1.0))
     if aside > MOST_SIDEWAYS:
         raise InputError(
-            f"{folder}: the places move {np.rad2deg(aside):.0f} degrees aside of yaw, as "
-            "where latitude and longitude are swapped, or yaw is in degrees; correct the files"
+            f"{folder}: the car moves {np.rad2deg(aside):.0f} degrees off its yaw angle, as if latitude and "
+            "longitude were swapped, or yaw were in degrees; correct the files"
         )
 
 
 def _read_oxts(path: Path) -> list[float]:
     """Latitude and longitude in degrees, altitude in metres; roll, pitch and yaw in radians."""
     wanted = "it begins with latitude, longitude, altitude, roll, pitch and yaw"
-    values = numbers(f"{path}:1", read_lines(path, "unpack the drive again")[0].split()[:6], 6, wanted)
+    values = parse_numbers(f"{path}:1", read_lines(path, "unpack the drive again")[0].split()[:6], 6, wanted)
     if not (abs(values[0]) < 90 and abs(values[1]) <= 360 and abs(values[2]) < 1e5):
-        raise InputError(f"{path}:1: no place on earth, but {wanted}; correct the line")
+        raise InputError(f"{path}:1: not a place on earth, but {wanted}; correct the line")
     if max(map(abs, values[3:])) > 2 * math.pi:
         raise InputError(f"{path}:1: an angle is above 2 pi, but {wanted} (radians); correct the line")
     return values
 
 
 def _imu_poses(rows: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4), x east and y north, of rows as :func:`_read_oxts` gives them (N, 6)."""
+    """Poses (N, 4, 4), x east and y north, from rows (N, 6) as :func:`_read_oxts` returns them."""
     from scipy.spatial.transform import Rotation
 
     latitude, longitude = np.deg2rad(rows[:, :2].T)

@@ -1,4 +1,4 @@
-"""Writes a simulated sequence in KITTI's odometry layout, which `kitti.load` and other tools read."""
+"""Writes a simulated sequence in KITTI's odometry layout, for `kitti.load` and other programs."""
 
 import os
 from functools import partial
@@ -19,43 +19,48 @@ from rcnn_odom.recordings.workers import Workers, useful_workers
 Points = npt.NDArray[np.float32]
 
 NO_RETURN = np.array([[np.nan, np.nan, np.nan, 0.0]], dtype=np.float32)
-"""Stands for a frame in which no beam came back: a file of 0 bytes would pass for one cut off. Readers
-drop a point that is not finite, which is how some drivers write a missing return."""
+"""Written for a frame without returns, because readers would take an empty file for one that was cut off.
+Readers drop a point that is not finite: some drivers write missing returns in this way."""
 
 FOCAL, CENTRE, SHIFTS = 700.0, (600.0, 180.0), (0.0, -350.0, 0.0, -350.0)
-"""Pixels, and pixels times metres (the right cameras are half a metre to the right): KITTI's four cameras in
-round numbers. Nothing is rendered with them, but readers expect P0 to P3."""
+"""Focal length and image centre in pixels, and shifts in pixels times metres (the right cameras are half a
+metre to the right): rounded values of KITTI's four cameras. Readers expect P0 to P3, although the sequence
+has no images."""
 
 
 @runtime_checkable
 class PointReader(Protocol):
-    """A ``read_scan`` that also gives the points it makes scans of."""
+    """A ``read_scan`` that also gives the points from which it makes scans."""
 
     def points(self, frame: int) -> Points:
-        """x, y, z in metres in the laser's frame and reflectance, (P, 4), by azimuth in [0, 2 pi)."""
+        """x, y, z in metres in the laser's frame and reflectance, (P, 4), sorted by azimuth in [0, 2 pi)."""
 
 
 def need_free_name(root: Path, name: str) -> None:
     """Check that a sequence of this name can be added below ``root``.
 
     Raises:
-        InputError: the name is no plain name of a folder, or is taken.
+        InputError: the name cannot be the name of a folder, or is taken.
     """
     if not name or name.startswith(".") or os.path.basename(name) != name:
-        raise InputError(f"sequence '{name}': must be the name of a folder, without / and no dot first")
+        raise InputError(f"sequence '{name}': must be the name of a folder, without / or a leading dot")
     for path in (root / "sequences" / name, root / "poses" / f"{name}.txt"):
         if path.exists():
             raise InputError(f"{path}: is there already; remove it, or choose another --out or --sequence")
 
 
 def export_kitti(sequence: Recording, root: Path) -> None:
-    """Write a sequence, whose ``read_scan`` is a `PointReader`, below ``root`` in KITTI's layout.
+    """Write a sequence below ``root`` in KITTI's layout.
 
-    The poses are told in the camera's frame and begin with the identity, as KITTI's do; what `kitti.load`
-    reads back has the same scans to the bit. All is made in a hidden folder and moved when complete.
+    As in KITTI, the poses are in the camera's frame and begin with the identity. `kitti.load` reads back
+    exactly the same scans. The files are written to a hidden folder, which is moved when it is complete.
+
+    Args:
+        sequence: recording whose ``read_scan`` is a `PointReader`.
+        root: folder for ``sequences`` and ``poses``.
 
     Raises:
-        InputError: the name is taken or unfit, or the files cannot be written.
+        InputError: the name is not allowed or taken, or the files cannot be written.
     """
     need_free_name(root, sequence.name)
     reader = sequence.read_scan
@@ -71,7 +76,7 @@ def export_kitti(sequence: Recording, root: Path) -> None:
             np.savetxt(folder / "times.txt", sequence.stamps, fmt="%e")
             from_first = np.linalg.inv(sequence.poses[0]) @ sequence.poses
             write_kitti(poses, change_frame(from_first, sequence.camera_from_laser))
-            # The poses come last: without them a reader takes the sequence for incomplete.
+            # The poses are moved last: a reader refuses a sequence without poses as incomplete.
             folder.rename(root / "sequences" / sequence.name)
             poses.rename(root / "poses" / f"{sequence.name}.txt")
     except OSError as error:

@@ -1,7 +1,8 @@
-"""Whether points lie in the frame of the laser that saw them: its beams are cones about a place on its axis.
+"""Checks that points are in the frame of their laser, where each ring lies on a cone about the z axis.
 
-A cloud that was raised, to the ground or a robot's base, can still be read: only the cones' tops lie
-elsewhere. In a tilted cloud, or in a camera's frame, the points of a ring lie on no such cone.
+A cloud that was shifted along z, for instance to the ground or to a robot's base, can still be used, because
+only the apex of the cones moves. In a tilted cloud, or in a camera's frame, the points of a ring lie on no
+such cone.
 """
 
 from collections.abc import Iterable, Sequence
@@ -13,14 +14,15 @@ from rcnn_odom.recordings.velodyne import HIGHEST, HIGHEST_RISE, Points, elevati
 
 STEEP = np.deg2rad(45.0)
 MOST_STEEP = 0.3
-"""Part of the points that may be steeper; in a camera's frame, z ahead, nearly half of them are."""
-CLEARER = 2.0
-"""A rise is believed that makes the rings so many times narrower."""
+"""Largest part of the points that are steeper than ``STEEP``; in a camera's frame nearly half of them are."""
+LEAST_NARROWING = 2.0
+"""A rise must make the rings at least this many times narrower."""
 ONE_SIGMA = 68.0
+"""Per cent of a normal distribution within one standard deviation."""
 
 
 def describe_steepness(clouds: Sequence[Points]) -> str:
-    """Why clouds, each (P, 3 or more), are not in their laser's frame; empty where they may be."""
+    """Why clouds, each (P, 3 or more), are not in their laser's frame; empty if they can be."""
     points = np.concatenate(clouds)
     steep = float(np.mean(np.abs(elevations_from(points, 0.0)) > STEEP)) if len(points) else 0.0
     if steep <= MOST_STEEP:
@@ -29,7 +31,10 @@ def describe_steepness(clouds: Sequence[Points]) -> str:
 
 
 def find_rise(rings: Iterable[Points]) -> float:
-    """Metres by which points were raised above where their laser's beams meet; 0: not that one could tell.
+    """Find the height in metres by which points were shifted along z; 0 if no shift is evident.
+
+    It is the height at which the beams meet, fitted to all rings, if this height makes the rings clearly
+    narrower than a height within ``HIGHEST`` of the origin does.
 
     Args:
         rings: the points (P, 3 or more) of each laser.
@@ -44,11 +49,11 @@ def find_rise(rings: Iterable[Points]) -> float:
     rise = float(np.clip(closeness @ slope / square, -HIGHEST_RISE, HIGHEST_RISE))
     usual = float(np.clip(rise, -HIGHEST, HIGHEST))
     width, width_without = (float(np.median(np.abs(slope - h * closeness))) for h in (rise, usual))
-    return rise if CLEARER * width < width_without else 0.0
+    return rise if LEAST_NARROWING * width < width_without else 0.0
 
 
 def _centre(ring: Points) -> FloatArray:
-    """1 / distance and z / distance (2, P) of a ring's points, about their means."""
+    """1 / distance and z / distance (2, P) of a ring's points, minus their means."""
     x, y, z = ring[:, :3].astype(np.float64).T
     distance = np.maximum(np.hypot(x, y), 1.0)
     both = np.stack([1 / distance, z / distance])
@@ -56,8 +61,8 @@ def _centre(ring: Points) -> FloatArray:
     return centred
 
 
-def lowered(points: Points, rise: float) -> Points:
-    """The points (P, 3 or more) in the frame in which the beams meet at the height 0."""
+def lower_points(points: Points, rise: float) -> Points:
+    """Shift points (P, 3 or more) down by ``rise`` metres, so that the beams meet at height 0."""
     if rise == 0.0:
         return points
     points = points.copy()
@@ -66,10 +71,10 @@ def lowered(points: Points, rise: float) -> Points:
 
 
 def cone_spread(rings: Iterable[Points]) -> float:
-    """How far the points of one laser lie from their cone in radians, as a standard deviation but robust.
+    """Robust standard deviation in radians of one laser's points about their cone.
 
     Args:
-        rings: its points (P, 3 or more) in each of some frames.
+        rings: the points (P, 3 or more) of the laser, one array for each frame.
     """
     points = np.concatenate([ring[:, :3] for ring in rings])
     if not len(points):

@@ -1,4 +1,4 @@
-"""ROS's message LaserScan, from a bag, a live node or rosbridge, as a scan."""
+"""Converts ROS's message LaserScan, from a bag, a live node or rosbridge, to a scan."""
 
 import math
 from dataclasses import replace
@@ -10,11 +10,11 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.scan import Scan
 
 ANGLES_AGREE = 2.0
-"""Beams by which angle_max may be off: drivers count the last one differently."""
+"""Beam spacings by which angle_max may be off: drivers count the last beam differently."""
 LONGEST_SCAN = 10.0
-"""Seconds: what claims to take longer says nothing about its beams."""
+"""Seconds; longer times within a scan are taken to be wrong."""
 NO_RETURN_CODE = 0.98
-"""Of the largest reading: what lies above is at the constant that a laser writes where nothing came back."""
+"""Readings above this part of the largest one are the constant that a laser writes for no return."""
 
 
 def from_laser_scan(
@@ -29,34 +29,34 @@ def from_laser_scan(
     stamp: float | None = None,
     frame_id: str = "",
 ) -> Scan:
-    """The scan of a LaserScan message, whose angles count as ours do (REP 103).
+    """Make a scan from the fields of a LaserScan message; angles have the same convention (REP 103).
 
-    Some drivers leave a limit at 0 or write nan: a limit that no laser can have limits nothing. Nor does a
-    maximum that most readings contradict.
+    Some drivers leave a limit at 0 or nan, so impossible limits are ignored. A maximum range is ignored as
+    well if most readings lie beyond it.
 
     Args:
-        ranges: (P,) metres; nan, and below ``range_min`` no return (REP 117).
-        angle_min, angle_increment: radians, of the first beam and from one beam to the next; a negative
-            increment is a laser that turns clockwise.
-        angle_max: radians, of the last beam; where the increment is 0 or nan, the beams are even up to it.
-        range_min, range_max: metres. At ``range_max`` or beyond it a reading is no return, and infinite here.
+        ranges: (P,) metres; nan and readings below ``range_min`` are no returns (REP 117).
+        angle_min, angle_increment: radians, angle of the first beam and from one beam to the next; the
+            increment of a laser that turns clockwise is negative.
+        angle_max: radians, angle of the last beam; used if the increment is 0 or nan.
+        range_min, range_max: metres. A reading at or beyond ``range_max`` is no return and becomes infinite.
             A maximum that is nan or not above the minimum is unknown.
         time_increment: seconds from one beam to the next; not positive: unknown.
         scan_time: seconds from one scan to the next, see :func:`assume_even_turn`; not positive, or more
             than ten: unknown.
-        stamp: seconds; None where there is no clock.
+        stamp: seconds; None if there is no clock.
         frame_id: name of the laser's frame.
 
     Raises:
-        ValueError: the angles do not say where the beams lie.
+        ValueError: the directions of the beams do not follow from the angles.
 
     >>> from_laser_scan([1.0, 9.0, 0.0], 0.0, 0.5, range_max=8.0).ranges
     array([ 1., inf,  0.])
     """
-    with np.errstate(over="ignore", invalid="ignore"):  # encoders leave out bearings that are no numbers
+    with np.errstate(over="ignore", invalid="ignore"):  # encoders omit bearings that are not finite
         values = np.array(ranges, dtype=np.float64)
         beam = np.arange(len(values), dtype=np.float64)
-        spacing = _spacing(angle_min, angle_increment, angle_max, len(values))
+        spacing = _compute_spacing(angle_min, angle_increment, angle_max, len(values))
         bearings = angle_min + spacing * beam
     # Comparisons with nan are false.
     if range_max > max(range_min, 0.0) and not has_most_beyond(values, range_max):
@@ -75,25 +75,36 @@ def from_laser_scan(
 
 
 def compare_angles(angle_min: float, angle_increment: float, angle_max: float, count: int) -> str:
-    """What a message's angles (radians) say against each other, for a user; empty where they agree.
+    """Check that the angles of a message agree.
 
-    An angle_max of 0 or nan was not set.
+    Args:
+        angle_min, angle_increment, angle_max: radians; an angle_max of 0 or nan was not set.
+        count: number of readings.
+
+    Returns:
+        A message about the contradiction; empty if the angles agree.
+
+    >>> compare_angles(0.0, 0.5, 1.0, 3)
+    ''
     """
-    covered, said = angle_increment * (count - 1), angle_max - angle_min
+    covered, extent = angle_increment * (count - 1), angle_max - angle_min
     if count < 2 or not angle_increment or not angle_max:
         return ""
-    if not abs(covered - said) > ANGLES_AGREE * abs(angle_increment):  # not so of nan
+    if not abs(covered - extent) > ANGLES_AGREE * abs(angle_increment):  # False for nan
         return ""
     return (
-        f"its angle_max says that the beams cover {math.degrees(said):.4g} degrees, its angle_increment and "
-        f"{count} readings {math.degrees(covered):.4g}; the latter count"
+        f"its angle_max says that the beams cover {math.degrees(extent):.4g} degrees, its angle_increment "
+        f"and {count} readings say {math.degrees(covered):.4g}; angle_max is not used"
     )
 
 
 def has_most_beyond(ranges: FloatArray, limit: float) -> bool:
     """Whether more than half of the readings (P,) are beyond a limit in metres.
 
-    Readings at the largest one do not count, on either side: lasers write it where nothing came back.
+    Readings near the largest one are left out of the count, because many lasers write it for no return.
+
+    >>> has_most_beyond(np.array([3.0, 9.0, 9.5, 81.0, 81.0]), limit=8.0)
+    True
     """
     given = ranges[(ranges > 0) & np.isfinite(ranges)]
     measured = given[given < NO_RETURN_CODE * given.max(initial=0.0)]
@@ -101,12 +112,12 @@ def has_most_beyond(ranges: FloatArray, limit: float) -> bool:
 
 
 def assume_even_turn(scan: Scan) -> Scan:
-    """The scan, its beams one after the other as the laser turns, where only the time of a turn is known.
+    """Give the beams of a scan the times of a steady turn, if only the time of a whole turn is known.
 
-    Not so unless a user says it: drivers of lasers that turn write ``time_increment``; what writes only
-    ``scan_time`` is mostly a depth camera, a merger of scans or a cut through a cloud, whose beams were shot
-    at once or in another order. A laser of less than 360 degrees turns on unseen: its beams take only their
-    part of the turn.
+    Use it only if the user says that the laser turns. Drivers of such lasers write ``time_increment``. A
+    source with only ``scan_time`` is mostly a depth camera, a merger of scans or a slice of a cloud, whose
+    beams were measured at once or in another order. A laser with a field of view below 360 degrees spends
+    only a part of the turn on its beams.
 
     >>> scan = from_laser_scan([1.0] * 4, 0.0, math.pi / 2, scan_time=0.2)
     >>> scan.times is None, assume_even_turn(scan).times.round(3).tolist()
@@ -119,12 +130,19 @@ def assume_even_turn(scan: Scan) -> Scan:
 
 
 def checked_times(times: FloatArray) -> FloatArray | None:
-    """Seconds (P,) of beams after their scan's stamp; None where one is more than ten or no number."""
+    """Check the times of beams.
+
+    Args:
+        times: (P,) seconds after the stamp of the scan.
+
+    Returns:
+        The times; None if one is nan or above ``LONGEST_SCAN``.
+    """
     return times if bool((np.abs(times) <= LONGEST_SCAN).all()) else None
 
 
-def _spacing(angle_min: float, angle_increment: float, angle_max: float, count: int) -> float:
-    """Radians from beam to beam; some drivers leave it out, and the last beam's angle tells it."""
+def _compute_spacing(angle_min: float, angle_increment: float, angle_max: float, count: int) -> float:
+    """Radians from beam to beam; taken from the angle of the last beam if the increment is missing."""
     if not math.isfinite(angle_min):
         raise ValueError(f"its angle_min is {angle_min}")
     if count < 2 or (math.isfinite(angle_increment) and angle_increment != 0):

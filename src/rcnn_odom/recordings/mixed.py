@@ -1,4 +1,4 @@
-"""Recordings of several formats and lasers in one training: logs, simulated worlds, SOURCE/NAME."""
+"""Mixes recordings of several formats and lasers in one training; they are named SOURCE/NAME."""
 
 import hashlib
 from collections.abc import Mapping
@@ -11,9 +11,9 @@ from rcnn_odom.recordings import formats
 from rcnn_odom.recordings.recording import Recording
 
 PARTLY = "partial"
-"""Option of a source: its laser may be a part of ``data.sensor``."""
+"""Option of a source: its laser may cover only a part of ``data.sensor``."""
 NEW_WORLDS = "fresh_worlds"
-"""Option of the data whose format makes new worlds."""
+"""Option of the formats that make new worlds."""
 
 
 def _are_sources(sources: Mapping[str, Any]) -> bool:
@@ -25,7 +25,7 @@ def _are_sources(sources: Mapping[str, Any]) -> bool:
 
 @dataclass(kw_only=True)
 class Options:
-    """What ``conf/data/mixed.yaml`` sets beside what all data have."""
+    """Options of ``conf/data/mixed.yaml`` that are not common to all data."""
 
     fresh_worlds: bool
     keep_worlds: bool
@@ -37,26 +37,24 @@ class Options:
 
 
 def load(name: str, *, sources: Mapping[str, Mapping[str, Any]]) -> Recording:
-    """A recording of one of several readers.
+    """Load a recording from one of several sources.
 
     Args:
-        name: ``SOURCE/NAME``; NAME is what the source's own reader calls it.
-        sources: by SOURCE the ``format`` and the options of its ``load``, and ``partial``: true where the
-            source's laser may see only a part of what ``data.sensor`` covers, with beams farther apart than
-            its bins. They must still lie within its field of view.
+        name: ``SOURCE/NAME``; NAME is the recording's name in the source.
+        sources: for each SOURCE the ``format``, the options of its ``load``, and optionally ``partial``: true
+            if the source's laser may cover only a part of the field of view of ``data.sensor``, with beams
+            farther apart than its bins. The beams must lie within that field of view.
 
     Returns:
         The recording under the name ``SOURCE/NAME``. It keeps its world unless its format makes new ones.
 
     Raises:
-        InputError: the name has no source or an unknown one, an option of the source is wrong, or as of its
-            reader.
+        InputError: the name has no source or an unknown one, an option of the source is wrong, or the
+            recording cannot be loaded.
     """
     source, separator, own_name = name.partition("/")
     if not separator or source not in sources or not own_name:
-        raise InputError(
-            f"sequence {name}: is none of a source; write SOURCE/NAME with one of {', '.join(sources)}"
-        )
+        raise InputError(f"sequence {name}: must be SOURCE/NAME with one of the sources {', '.join(sources)}")
     reader = dict(sources[source])
     partly = reader.pop(PARTLY, False)
     if not isinstance(partly, bool):
@@ -66,7 +64,7 @@ def load(name: str, *, sources: Mapping[str, Mapping[str, Any]]) -> Recording:
     except InputError as error:
         raise InputError(f"data.sources.{source}: {str(error).removeprefix('data.reader: ')}") from error
     key = recording.fingerprint
-    if partly:  # other scans fit
+    if partly:  # changes which scans fit, and so the encoded scans
         key = hashlib.sha256(f"{key} {PARTLY}".encode()).hexdigest()
     return replace(
         recording,

@@ -1,4 +1,4 @@
-"""Files by their first bytes: packed ones are unpacked, and what a file is does not depend on its name."""
+"""Opens compressed files; the kind of a file is found from its first bytes, not from its name."""
 
 import bz2
 import gzip
@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, cast
 from rcnn_odom.errors import InputError
 
 HEAD = 4096
-"""Bytes that tell what a file is."""
+"""Number of first bytes from which the kind of a file is found."""
 LFS_POINTER = b"version https://git-lfs.github.com/spec/"
 ARCHIVES = {
     b"PK\x03\x04": "a zip archive",
@@ -30,7 +30,7 @@ def _open_zstd(path: Path) -> BinaryIO:
 
 
 def import_zstd() -> Any:
-    """The module of Python 3.14, or its backport; unlike others they tell where a file was cut off."""
+    """Import zstd, from Python 3.14 or its backport: these modules detect files that are cut off."""
     return import_module("compression.zstd" if sys.version_info >= (3, 14) else "backports.zstd")
 
 
@@ -40,21 +40,21 @@ PACKINGS: dict[bytes, Callable[..., Any]] = {
     b"\xfd7zXZ\x00": lzma.open,
     b"\x28\xb5\x2f\xfd": _open_zstd,
 }
-"""First bytes of packed files, and what opens them for reading bytes."""
+"""First bytes of compressed files, and the functions that open them for reading bytes."""
 
 
 def is_packed(path: Path) -> bool:
-    """Whether a file is packed by gzip, bzip2, xz or zstd."""
-    return _packing(_first_bytes(path)) is not None
+    """Whether a file is compressed by gzip, bzip2, xz or zstd."""
+    return _find_opener(_first_bytes(path)) is not None
 
 
 def open_unpacked(path: Path) -> BinaryIO:
-    """What a file holds, unpacked while it is read.
+    """Open a file for reading its content, which is decompressed while it is read.
 
-    Reading a packed file that is damaged or cut off raises one of :func:`unpacking_errors`.
+    Reading a compressed file that is damaged or cut off raises one of :func:`unpacking_errors`.
 
     Raises:
-        InputError: it cannot be read, or is an archive of files or a pointer of Git LFS.
+        InputError: the file cannot be read, or is an archive or a pointer of Git LFS.
     """
     head = _first_bytes(path)
     refuse_pointer(path, head)
@@ -62,17 +62,21 @@ def open_unpacked(path: Path) -> BinaryIO:
         if head.startswith(magic):
             raise InputError(f"{path}: is {kind}; unpack it and give the recording in it")
     try:
-        file: BinaryIO = (_packing(head) or _open_plain)(path)
+        file: BinaryIO = (_find_opener(head) or _open_plain)(path)
         return file
     except OSError as error:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
 
 
 def refuse_pointer(path: str | Path, head: bytes) -> None:
-    """Refuses what Git LFS leaves in place of a large file that it has not fetched.
+    """Check that a file is not a pointer, which Git LFS writes in place of a large file that was not fetched.
+
+    Args:
+        path: path of the file, for the error.
+        head: first bytes of the file.
 
     Raises:
-        InputError: the first bytes of the file are those of such a pointer.
+        InputError: it is such a pointer.
     """
     if head.startswith(LFS_POINTER):
         raise InputError(f"{path}: is a pointer of Git LFS, not the file itself; fetch it with git lfs pull")
@@ -83,10 +87,10 @@ def _open_plain(path: Path) -> BinaryIO:
 
 
 def read_head(path: Path) -> bytes:
-    """The first bytes of what a file holds, unpacked; ``HEAD`` of them at most.
+    """Read the first bytes of a file's content after decompression, at most ``HEAD``.
 
     Raises:
-        InputError: see :func:`open_unpacked`; or nothing of a packed file can be unpacked.
+        InputError: as for :func:`open_unpacked`; or the first bytes cannot be decompressed.
     """
     with open_unpacked(path) as file:
         try:
@@ -99,16 +103,16 @@ def read_head(path: Path) -> bytes:
 
 
 def unpacking_errors() -> tuple[type[Exception], ...]:
-    """What reading a packed file raises where it is damaged or cut off."""
+    """The exceptions from reading a compressed file that is damaged or cut off."""
     return EOFError, OSError, zlib.error, lzma.LZMAError, import_zstd().ZstdError
 
 
 @contextmanager
 def unpacked_file(path: Path) -> Iterator[Path]:
-    """A file to be read in any order: the path itself, or that of a temporary file with what it holds.
+    """Path of a file that can be read in any order: the file, or a temporary file with its unpacked content.
 
     Raises:
-        InputError: it cannot be read or unpacked to its end.
+        InputError: the file cannot be read or decompressed to its end.
     """
     if not is_packed(path):
         yield path
@@ -131,5 +135,6 @@ def _first_bytes(path: Path) -> bytes:
         raise InputError(f"{path}: cannot be read ({error.strerror}); give another file") from error
 
 
-def _packing(head: bytes) -> Callable[..., Any] | None:
+def _find_opener(head: bytes) -> Callable[..., Any] | None:
+    """The function that opens a compressed file with these first bytes; None if it is not compressed."""
     return next((open_ for magic, open_ in PACKINGS.items() if head.startswith(magic)), None)

@@ -1,6 +1,6 @@
-"""Parts of recordings, as ``data.train``, ``data.val`` and ``data.test`` name them: ``NAME[0.0:0.85]``.
+"""Cuts parts from recordings; ``data.train``, ``data.val`` and ``data.test`` name them ``NAME[0.0:0.85]``.
 
-``NAME[::3]`` takes every third scan, ``NAME[0.5::3]`` every third of the second half.
+``NAME[::3]`` is every third scan, ``NAME[0.5::3]`` is every third scan of the second half.
 """
 
 import logging
@@ -21,12 +21,12 @@ FRACTION = r"(?:\d+\.?\d*|\.\d+)?"
 
 
 class Part(NamedTuple):
-    """Which scans of which recording.
+    """A part of a recording.
 
     Attributes:
         file: name of the recording.
-        start, stop: fractions of the recording, between which the part lies.
-        every: 3 for each third scan of it.
+        start, stop: fractions of the recording, from 0 to 1, at which the part begins and ends.
+        every: take every ``every``-th scan of the part; 1: all.
     """
 
     file: str
@@ -36,10 +36,10 @@ class Part(NamedTuple):
 
 
 def parse_part(name: str) -> Part:
-    """What ``NAME``, ``NAME[a:b]`` or ``NAME[a:b:n]`` asks for.
+    """Parse ``NAME``, ``NAME[a:b]`` or ``NAME[a:b:n]``.
 
     Raises:
-        InputError: the brackets do not hold fractions with a < b, or n is no whole number from 1 on.
+        InputError: the brackets do not hold fractions with a < b, or n is not a whole number above 0.
 
     >>> parse_part("10[0.25:]")
     Part(file='10', start=0.25, stop=1.0, every=1)
@@ -50,8 +50,8 @@ def parse_part(name: str) -> Part:
     if match is None:
         if "[" in name:
             raise InputError(
-                f"sequence {name!r}: a part is written NAME[0.0:0.85], fractions of the drive, every third "
-                "scan NAME[::3]"
+                f"sequence {name!r}: a part is written as NAME[0.0:0.85], with fractions of the drive; every "
+                "third scan is NAME[::3]"
             )
         return Part(name)
     start, stop, every = float(match[2] or 0), float(match[3] or 1), match[4] or "1"
@@ -65,14 +65,14 @@ def parse_part(name: str) -> Part:
 
 
 def cut(drives: Mapping[str, Drive], name: str) -> Drive:
-    """The part of a recording that ``name`` asks for, without the ends whose truth is unknown.
+    """Cut a part from a recording, without frames at its ends whose true poses are unknown.
 
     Args:
-        drives: whole recordings by their name.
-        name: of a recording, or ``NAME[a:b]`` or ``NAME[a:b:n]``.
+        drives: whole recordings by their names.
+        name: name of a recording, or ``NAME[a:b]`` or ``NAME[a:b:n]``.
 
     Raises:
-        InputError: the truth has gaps inside, or fewer than two frames are left.
+        InputError: true poses are unknown between known ones, or fewer than two frames are left.
     """
     file, start, stop, every = parse_part(name)
     whole = drives[file]
@@ -81,30 +81,33 @@ def cut(drives: Mapping[str, Drive], name: str) -> Drive:
     if len(known) < 2:
         raise InputError(
             f"sequence {name} has {len(known)} frames with known poses, but two are needed; give a longer "
-            "recording or part, or a truth that knows more of it"
+            "recording or part, or a truth that covers more of it"
         )
     first, last = int(known[0]), int(known[-1])
     assert part.frames is not None
     if len(known) != last - first + 1:
         gap = int(np.flatnonzero(np.diff(known) > 1)[0])
         raise InputError(
-            f"sequence {file}: the truth is unknown at frame {part.frames[int(known[gap]) + 1]}, between "
-            "known ones; use parts of it, NAME[a:b]"
+            f"sequence {file}: the true pose of frame {part.frames[int(known[gap]) + 1]} is unknown, between "
+            "known ones; use parts of the recording, NAME[a:b]"
         )
     if len(known) != len(part):
-        log.info("%s: frames %d to %d of %d, where the truth is known", name, first, last, len(part))
+        log.info("%s: uses frames %d to %d of %d, whose true poses are known", name, first, last, len(part))
     return part.part(first, last + 1)
 
 
 def trusted_pieces(drive: Drive, least: int) -> list[Drive]:
-    """The pieces of a drive in which every true step is good enough to learn from; without doubt the drive.
+    """Split a drive at the true steps that are not trusted.
 
     Args:
-        drive: to train on.
-        least: frames that a piece must have.
+        drive: drive to train on.
+        least: smallest number of frames of a piece; shorter pieces are dropped.
+
+    Returns:
+        The pieces, in which every true step is trusted; the drive itself if all its steps are.
 
     Raises:
-        InputError: there is no such piece.
+        InputError: there is no piece of ``least`` frames.
     """
     doubted = [] if drive.trusted is None else (np.flatnonzero(~drive.trusted[1:]) + 1).tolist()
     if not doubted:
@@ -117,8 +120,8 @@ def trusted_pieces(drive: Drive, least: int) -> list[Drive]:
     ]
     if not pieces:
         raise InputError(
-            f"training sequence {drive.name}: nowhere are {least} scans in a row without a step whose truth "
-            "is doubtful; leave it out of data.train, or set model.window lower"
+            f"training sequence {drive.name}: no {least} scans in a row are without a doubtful true step; "
+            "leave it out of data.train, or set model.window lower"
         )
     log.info(
         "%s: %d of %d scans to train on, in %d pieces",

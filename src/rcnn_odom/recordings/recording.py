@@ -1,4 +1,4 @@
-"""What every recording looks like once it has been opened, and a drive as estimators are given it."""
+"""An opened recording, and a drive: the recording with its encoded scans, as estimators get it."""
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
@@ -11,39 +11,43 @@ from rcnn_odom.geometry import FORWARD_CAMERA, FloatArray, change_frame, motions
 from rcnn_odom.recordings.scan import Scan
 
 ReadScan = Callable[[int], Scan]
-"""Frame number -> its scan."""
+"""Reads the scan of a frame number."""
 OpenRecording = Callable[[str], "Recording"]
-"""Name -> the recording; picklable, since encoding runs in processes."""
+"""Opens a recording by its name; picklable, because other processes encode the scans."""
 
 
 def wants_deskew(choice: str, is_compensated: bool) -> bool:
-    """Whether scans are to be undistorted.
+    """Whether scans must be undistorted.
 
     Args:
-        choice: ``on``, ``off``, or ``auto``: unless the recording is compensated already.
-        is_compensated: as of :class:`Recording`.
+        choice: ``on``, ``off``, or ``auto``, which means on unless the recording is compensated already.
+        is_compensated: as in :class:`Recording`.
+
+    >>> wants_deskew("auto", is_compensated=False)
+    True
     """
     return choice == "on" or (choice == "auto" and not is_compensated)
 
 
 @dataclass(frozen=True)
 class Recording:
-    """One drive: scans in file order with the truth about where each was taken.
+    """One drive: its scans in the order of the file, with the true pose of each.
 
     Attributes:
-        name: as a user names it, for instance ``05`` or ``mit-killian``.
-        poses: (N, 4, 4) laser to world. nan where the truth is unknown.
+        name: the user's name of the recording, for instance ``05`` or ``mit-killian``.
+        poses: (N, 4, 4) laser to world; nan if the true pose is unknown.
         stamps: (N,) seconds.
-        read_scan: one frame's scan; a picklable callable, since encoding runs in processes.
-        fingerprint: changes whenever ``read_scan`` would return something else: the cache's key.
-        camera_from_laser: (4, 4), KITTI's ``Tr``: the frame in which trajectories are written.
-        wheel_odometry: (N, 4, 4) laser poses by the robot's own odometry, where the log has them.
-        notes: what the reader noticed, counted or flagged, in words for the user.
-        has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
-        is_compensated: the motion of the laser during a revolution has been taken out of its points already.
-        keeps_world: there is no other drive of its kind, so that a training on new worlds keeps it.
-        has_partial_laser: as the user says, the laser may see a part of what the sensor covers, with beams
-            farther apart than the sensor's bins.
+        read_scan: reads the scan of a frame; picklable, because other processes encode the scans.
+        fingerprint: changes whenever ``read_scan`` would return other scans; part of the cache's key.
+        camera_from_laser: (4, 4), KITTI's ``Tr``, to the frame in which trajectories are written.
+        wheel_odometry: (N, 4, 4) laser poses from the robot's own odometry; None if there is none.
+        notes: messages of the reader for the user.
+        has_clock: whether the stamps show order and gaps of the scans; otherwise only the order of the file
+            is used.
+        is_compensated: whether the motion of the laser during a revolution is already removed from the scans.
+        keeps_world: whether a training on new worlds keeps this drive, because its format makes no new ones.
+        has_partial_laser: whether the laser may cover only a part of the sensor's field of view, with beams
+            farther apart than the sensor's bins; the user sets it.
         trusted: (N,) whether the true step to a scan is good enough to learn from; None: all are.
     """
 
@@ -71,19 +75,19 @@ class Recording:
 
 @dataclass(frozen=True)
 class Drive:
-    """A recording, or a part of one, as estimators and scores are given it.
+    """A recording, or a part of one, as estimators and metrics get it.
 
     Attributes:
-        name: of the recording; of a part ``NAME[a:b]`` or ``NAME[a:b:n]``.
-        key: changes whenever ``scans`` does.
-        scans: (N, bins) float32, the encoded scans: depth vectors in metres; no bins for models that do not
-            look at them.
+        name: name of the recording; ``NAME[a:b]`` or ``NAME[a:b:n]`` for a part.
+        key: changes whenever ``scans`` changes.
+        scans: (N, bins) float32, the encoded scans: depth vectors in metres; (N, 0) for models that do not
+            use them.
         poses: (N, 4, 4) true laser poses.
         stamps: (N,) seconds.
         camera_from_laser, wheel_odometry, has_clock, is_compensated, trusted, keeps_world: as in
             :class:`Recording`.
-        read_scan: of the recording.
-        frames: the recording's frame of each scan; None: all of them.
+        read_scan: reads a scan of the recording by its frame number.
+        frames: frame number of each scan in the recording; None: the drive is the whole recording.
     """
 
     name: str
@@ -101,8 +105,8 @@ class Drive:
     keeps_world: bool = False
 
     @classmethod
-    def of(cls, recording: Recording, scans: npt.NDArray[np.float32], key: str) -> "Drive":
-        """A whole recording with its encoded scans (N, bins) and their key."""
+    def from_recording(cls, recording: Recording, scans: npt.NDArray[np.float32], key: str) -> "Drive":
+        """Make a drive of a whole recording with its encoded scans (N, bins) and their key."""
         return cls(
             name=recording.name,
             key=key,
@@ -120,14 +124,14 @@ class Drive:
 
     @classmethod
     def unencoded(cls, recording: Recording) -> "Drive":
-        """A whole recording for models that look at whole scans."""
-        return cls.of(recording, np.empty((len(recording), 0), np.float32), recording.fingerprint)
+        """Make a drive of a whole recording without encoded scans, for models that read the raw scans."""
+        return cls.from_recording(recording, np.empty((len(recording), 0), np.float32), recording.fingerprint)
 
     def __len__(self) -> int:
         return len(self.scans)
 
     def raw_scans(self) -> Iterator[Scan]:
-        """The scans as the laser gave them, one after the other; without stamps where there is no clock."""
+        """Yield the scans as the laser measured them; without stamps if ``has_clock`` is false."""
         assert self.read_scan is not None, f"{self.name} was made of encoded scans alone"
         for frame in self.frames or range(len(self)):
             scan = self.read_scan(frame)
@@ -140,16 +144,16 @@ class Drive:
 
     @property
     def motions(self) -> FloatArray:
-        """The paper's two numbers of the true steps, (N-1, 2): metres and radians."""
+        """The paper's motions of the true steps, (N-1, 2): distance (metres) and heading change (radians)."""
         return motions_of(self.steps)
 
     @property
     def camera_poses(self) -> FloatArray:
-        """True poses (N, 4, 4) in the frame of the trajectory files."""
+        """True poses (N, 4, 4) of the camera, the frame of trajectory files."""
         return change_frame(self.poses, self.camera_from_laser)
 
     def part(self, start: int, stop: int, name: str | None = None) -> "Drive":
-        """Frames start..stop-1, without a copy."""
+        """Frames start..stop-1 of the drive, without copying; ``name`` None: keep the drive's name."""
         wheel = self.wheel_odometry
         return replace(
             self,
@@ -163,7 +167,7 @@ class Drive:
         )
 
     def thin(self, every: int) -> "Drive":
-        """The first frame and every ``every``-th after it, without a copy; 1: all."""
+        """The first frame and every ``every``-th frame after it, without copying; 1: all frames."""
         wheel = self.wheel_odometry
         return replace(
             self,
@@ -171,13 +175,21 @@ class Drive:
             poses=self.poses[::every],
             stamps=self.stamps[::every],
             wheel_odometry=None if wheel is None else wheel[::every],
-            trusted=None if self.trusted is None else _trust_all(self.trusted, every),
+            trusted=None if self.trusted is None else _trust_merged_steps(self.trusted, every),
             frames=(self.frames or range(len(self)))[::every],
         )
 
 
-def _trust_all(trusted: npt.NDArray[np.bool_], every: int) -> npt.NDArray[np.bool_]:
-    """Whether all steps (N,) to a scan since the last one that stays are trusted, of the scans that stay."""
+def _trust_merged_steps(trusted: npt.NDArray[np.bool_], every: int) -> npt.NDArray[np.bool_]:
+    """Which steps between the remaining scans are trusted: those of which all original steps (N,) are.
+
+    Args:
+        trusted: (N,) whether the step to each scan is trusted.
+        every: the first scan and every ``every``-th scan after it remain.
+
+    Returns:
+        (M,) one value for each remaining scan.
+    """
     steps = np.concatenate([np.ones(every - 1, dtype=np.bool_), trusted])
     steps = steps[: (len(steps) // every) * every].reshape(-1, every)
     return np.logical_and.reduce(steps, axis=1)  # type: ignore[no-any-return]

@@ -1,4 +1,4 @@
-"""The truth of a recording that has none itself: a trajectory file beside it, matched by stamp."""
+"""Reads the true poses of a recording from a trajectory file, matched by stamp or by line."""
 
 import re
 from pathlib import Path
@@ -10,45 +10,46 @@ from rcnn_odom.geometry import FloatArray, change_frame, planar_to_poses, poses_
 from rcnn_odom.recordings.trajectory import file_name, read_kitti, read_tum
 
 MATCHER = "matcher"
-"""``data.reference=matcher``: readers then give poses of nan, and training fills in those of the matcher."""
+"""``data.reference=matcher``: readers give poses of nan, and training fills in the poses of scan matching."""
 FARTHEST_IN_TIME = 0.5
-"""Seconds: a pose that was measured further from its scan says nothing about it."""
+"""Seconds; largest time between a scan and the poses that it is interpolated from."""
 ENDINGS = r"\.(gz|bz2|xz|zstd?|bag|active|mcap|db3|log|clf|jsonl?|txt)$"
-"""What a trajectory leaves out of the name of its recording."""
+"""Endings of a recording's name that are not part of its trajectory's name."""
 
 
 def find_trajectory(reference: Path, name: str, has_clock: bool) -> Path:
-    """The trajectory file of a recording.
+    """Find the trajectory file of a recording.
 
     Args:
         reference: the file; or a folder with ``NAME.tum`` or ``NAME.txt``, or with the folder ``NAME`` that
-            ``rcnn-odom run --out`` wrote. NAME is that of the recording, with or without its endings.
-        name: of the recording.
-        has_clock: its scans have stamps; otherwise the file with a line for each scan is looked for first.
+            ``rcnn-odom run --out`` wrote. NAME is the name of the recording, with or without its endings.
+        name: name of the recording.
+        has_clock: whether the scans have stamps. If so, ``.tum`` is preferred, otherwise ``.txt``, which
+            has a line for each scan.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such file.
     """
     if reference.is_file():
         return reference
     kinds = (".tum", ".txt") if has_clock else (".txt", ".tum")
-    names = dict.fromkeys((file_name(name), Path(name).name, plain_name(name)))
+    names = dict.fromkeys((file_name(name), Path(name).name, strip_endings(name)))
     for each in names:
         for kind in kinds:
             for path in (reference / f"{each}{kind}", reference / each / f"trajectory{kind}"):
                 if path.is_file():
                     return path
-    wanted = plain_name(name)
+    wanted = strip_endings(name)
     raise InputError(
         f"{reference}: no trajectory of {name} in it; put {wanted}.tum or {wanted}.txt there, or set "
         "data.reference=matcher"
     )
 
 
-def plain_name(name: str) -> str:
-    """A recording's name without folders and endings.
+def strip_endings(name: str) -> str:
+    """Remove folders and endings from a recording's name.
 
-    >>> plain_name("logs/a.bag.gz")
+    >>> strip_endings("logs/a.bag.gz")
     'a'
     """
     name = Path(name).name
@@ -60,27 +61,28 @@ def plain_name(name: str) -> str:
 def read_reference(
     path: Path, stamps: FloatArray, has_clock: bool, camera_from_laser: FloatArray
 ) -> tuple[FloatArray, list[str]]:
-    """Laser poses (N, 4, 4) at the moments of scans, nan where the file has none near in time.
+    """Read the laser's poses at the times of the scans.
 
     Args:
-        path: in TUM's format (``.tum``), found by stamp; or in KITTI's with a line for each scan.
-        stamps: (N,) seconds, of the scans.
-        has_clock: these are to be believed.
-        camera_from_laser: (4, 4); the frame in which this project writes trajectories.
+        path: trajectory in TUM's format (``.tum``), whose poses are found by stamp; or in KITTI's format,
+            with a line for each scan.
+        stamps: (N,) seconds, stamps of the scans.
+        has_clock: whether the stamps are trusted; used for the error message.
+        camera_from_laser: (4, 4), to the frame in which this project writes trajectories.
 
     Returns:
-        The poses, and notes on them.
+        Poses (N, 4, 4), nan if the file has no pose near in time; and notes about them.
 
     Raises:
-        InputError: the file cannot be read, or is not about these scans.
+        InputError: the file cannot be read, or does not belong to these scans.
     """
     if path.suffix == ".tum":
         times, found = read_tum(path)
         times, first = np.unique(times, return_index=True)
-        found, words = in_laser_frame(found[first], camera_from_laser)
+        found, frame_note = in_laser_frame(found[first], camera_from_laser)
         poses = _interpolate(found, times, stamps)
     else:
-        found, words = in_laser_frame(read_kitti(path), camera_from_laser)
+        found, frame_note = in_laser_frame(read_kitti(path), camera_from_laser)
         if len(found) != len(stamps):
             raise InputError(
                 f"{path}: {len(found)} poses, but the recording has {len(stamps)} scans; give one pose a "
@@ -94,14 +96,21 @@ def read_reference(
             f"{path}: has no poses near the stamps of the recording{clock}, {stamps.min():.3f} to "
             f"{stamps.max():.3f} s; give its own trajectory"
         )
-    return poses, [f"truth: {path.name}, {words}", f"{unknown} scans without truth"]
+    return poses, [f"truth: {path.name}, {frame_note}", f"{unknown} scans without truth"]
 
 
 def in_laser_frame(poses: FloatArray, camera_from_laser: FloatArray) -> tuple[FloatArray, str]:
-    """Poses (N, 4, 4) of a planar motion as those of the laser, x forward and z up, and words on their frame.
+    """Transform poses of a planar motion to the laser's frame, x forward and z up.
 
-    This project writes them in a camera's frame, z forward and y down, most other programs with z up: the
-    axis about which a body turns, and along which it does not move, tells which.
+    This project writes poses in a camera's frame, z forward and y down; most other programs write them with z
+    up. The vertical axis is found as the one about which the body turns and along which it does not move.
+
+    Args:
+        poses: (N, 4, 4), in either frame.
+        camera_from_laser: (4, 4), transform from the laser's frame to the camera's.
+
+    Returns:
+        Poses (N, 4, 4) of the laser, and a note that names the frame of the given poses.
     """
     own = np.linalg.inv(poses[0]) @ poses
     travelled = max(float(np.abs(own[:, :3, 3]).max()), 1e-9)
@@ -115,7 +124,16 @@ def in_laser_frame(poses: FloatArray, camera_from_laser: FloatArray) -> tuple[Fl
 
 
 def _interpolate(poses: FloatArray, times: FloatArray, stamps: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) at ``stamps``, of those (M, 4, 4) at ascending ``times``; nan where none is near."""
+    """Interpolate poses in time.
+
+    Args:
+        poses: (M, 4, 4).
+        times: (M,) seconds of the poses, ascending.
+        stamps: (N,) seconds.
+
+    Returns:
+        Poses (N, 4, 4) at the stamps; nan if a pose before or after is farther than ``FARTHEST_IN_TIME``.
+    """
     planar = poses_to_planar(poses)
     after = np.clip(np.searchsorted(times, stamps), 0, len(times) - 1)
     before = np.where(np.abs(times[after] - stamps) < 1e-6, after, np.maximum(after - 1, 0))

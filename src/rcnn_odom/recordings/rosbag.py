@@ -1,7 +1,7 @@
-"""ROS bags with LaserScan or PointCloud2 messages: ROS 1, ROS 2 sqlite3 and mcap; no ROS is needed.
+"""Reads ROS bags with LaserScan or PointCloud2 messages: ROS 1, ROS 2 sqlite3 and mcap; no ROS is needed.
 
-Only the topics that are asked for are looked at, and their messages are read by the types that ROS itself
-has: what a bag says about other topics, or about its types, cannot keep it from being read.
+Only the requested topics are read, and their messages are decoded with ROS's own message definitions. So
+damaged topics that are not requested, and wrong message definitions in a bag, do no harm.
 """
 
 import logging
@@ -16,7 +16,7 @@ import numpy as np
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.bags.chunks import BrokenBag
-from rcnn_odom.recordings.bags.files import MENDED_BY, METADATA, Bag, is_bag, open_bag
+from rcnn_odom.recordings.bags.files import METADATA, REPAIR_ADVICE, Bag, is_bag, open_bag
 from rcnn_odom.recordings.bags.messages import Clock, deserialize, header_stamp
 from rcnn_odom.recordings.bags.point_cloud import (
     PLANE,
@@ -35,13 +35,14 @@ from rcnn_odom.recordings.stream import ScanStream
 log = logging.getLogger(__name__)
 
 SAMPLED_CLOUDS = 20
+"""Number of clouds from which the ring or the cut is chosen."""
 UNREADABLE = "messages that cannot be read"
 
 T = TypeVar("T")
 
 
 def recognises(path: Path) -> bool:
-    """Whether it is a bag or the folder of one by its first bytes, or named like one."""
+    """Whether the path is a bag or its folder, by its first bytes or by its name."""
     return is_bag(path)
 
 
@@ -54,28 +55,30 @@ def stream(
     base: str | None = None,
     laser_pose: tuple[float, float, float] | None = None,
 ) -> ScanStream:
-    """The scans of a bag, in the order of their arrival.
+    """Stream the scans of a bag in the order of their arrival.
 
-    The stamp is the header's, or where the first one's is 0 the time of arrival. A message that cannot
-    be read is skipped and counted.
+    Scans have the stamps of their headers; if the first header has the stamp 0, they have their times of
+    arrival. A message that cannot be read is skipped and counted.
 
     Args:
-        path: a file of a bag, packed or not; the folder of a ROS 2 bag, or the metadata.yaml in it.
-        topic: of the scans, with or without its first slash; None: the only one with LaserScan messages, or
-            where there is none with PointCloud2 messages.
-        ring: of point clouds, as they number them, or the row of clouds that lie in a grid; None: the most
+        path: a file of a bag, compressed or not; the folder of a ROS 2 bag, or the metadata.yaml in it.
+        topic: topic of the scans, with or without its first slash; None: the only topic with LaserScan
+            messages, or, if there is none, the only one with PointCloud2 messages.
+        ring: number of the ring in point clouds, or of the row in clouds that are a grid; None: the most
             level one.
-        height: metres from and to, in the frame of the cloud: a slice of point clouds instead of a ring.
-        odom_topic: of the robot's own odometry, with or without its first slash, which gives the scans their
-            ``wheel_pose``. It is moved from the robot's frame (the messages' ``child_frame_id``) to the
-            laser, as far as ``laser_pose`` or /tf_static says where that sits.
-        base: the robot's frame: /tf_static says where the laser sits in it, the stream's ``laser_pose``.
-        laser_pose: x and y in metres and heading in radians of the laser on the robot, in place of what
-            /tf_static says.
+        height: lowest and highest z in metres in the frame of the cloud: take a slice of point clouds
+            instead of a ring.
+        odom_topic: topic of the robot's own odometry, with or without its first slash, from which scans get
+            their ``wheel_pose``. The poses are transformed from the robot's frame (``child_frame_id`` of the
+            messages) to the laser, if ``laser_pose`` or /tf_static gives the laser's pose on the robot.
+        base: the robot's frame; the stream's ``laser_pose`` is then the pose of the laser in it by
+            /tf_static.
+        laser_pose: x and y in metres and heading in radians of the laser on the robot, instead of the pose
+            from /tf_static.
 
     Raises:
-        InputError: the bag cannot be opened, has no such topic or several, or cannot be cut so; or it does
-            not tell where the laser sits on ``base``, or not that it is level.
+        InputError: the bag cannot be opened, it has no such topic or several, the clouds have no such ring or
+            height, /tf_static does not give the pose of the laser in ``base``, or the laser is not level.
     """
     bag = open_bag(path)
     try:
@@ -92,14 +95,14 @@ def stream(
 
 
 def convert(message: Any, arrival: int = 0) -> Scan:
-    """The beams of a LaserScan message.
+    """Make a scan of a LaserScan message.
 
     Args:
-        message: of ``rosbags`` or of ROS 2.
-        arrival: nanoseconds, in place of a stamp of 0.
+        message: a message from ``rosbags`` or from ROS 2.
+        arrival: time of arrival in nanoseconds, used if the stamp of the header is 0.
 
     Raises:
-        ValueError: its angles do not say where its beams lie.
+        ValueError: the directions of the beams do not follow from the message's angles.
     """
     return from_laser_scan(
         message.ranges,
@@ -121,23 +124,23 @@ def _stream_lasers(
     if ring is not None or height is not None:
         given = "ring" if height is None else "height"
         raise InputError(
-            f"{path}: {topic.name} holds LaserScan messages, of which there is no {given} to choose; leave "
+            f"{path}: {topic.name} holds LaserScan messages, which have no {given} to choose; leave "
             f"--{given} out, or choose a topic with PointCloud2 messages with --topic"
         )
-    skipped, clock, told = Counter[str](), Clock(), list[str]()
+    skipped, clock, warned = Counter[str](), Clock(), list[str]()
 
     def to_scan(message: Any, arrival: int) -> Scan:
         scan = replace(convert(message), stamp=clock.stamp(message, arrival))
-        if not told:
+        if not warned:
             first, step, last = map(float, (message.angle_min, message.angle_increment, message.angle_max))
             if contradiction := compare_angles(first, step, last, len(scan.ranges)):
                 log.warning("%s: %s: %s", path, topic.name, contradiction)
-                told.append(contradiction)
+                warned.append(contradiction)
         return scan
 
     return ScanStream(
-        name=_name_of(path),
-        scans=_read(path, bag, topic, to_scan, skipped),
+        name=_bag_name(path),
+        scans=_read_messages(path, bag, topic, to_scan, skipped),
         total=topic.messages,
         notes=(f"{topic.messages} scans of {topic.name}", *bag.notes),
         skipped=skipped,
@@ -149,7 +152,7 @@ def _stream_clouds(
 ) -> ScanStream:
     clouds = _sample_clouds(path, bag, topic)
     try:
-        cut, about = choose_cut(clouds, ring, height)
+        cut, cut_note = choose_cut(clouds, ring, height)
     except ValueError as error:
         raise InputError(f"{path}: {topic.name} cannot be cut to a planar scan: {error}") from error
 
@@ -163,29 +166,29 @@ def _stream_clouds(
 
     is_ring = height is None and any(np.ptp(cloud.points[:, 2]) > PLANE for cloud in clouds)
     return ScanStream(
-        name=_name_of(path),
-        scans=_read(path, bag, topic, to_scan, skipped),
+        name=_bag_name(path),
+        scans=_read_messages(path, bag, topic, to_scan, skipped),
         total=topic.messages,
         beams=estimate_beams(clouds, cut) if is_ring else None,
-        notes=(f"{topic.messages} point clouds of {topic.name}", about, *bag.notes),
+        notes=(f"{topic.messages} point clouds of {topic.name}", cut_note, *bag.notes),
         skipped=skipped,
     )
 
 
-def _name_of(path: Path) -> str:
-    """Of a bag as a user knows it: of its folder where the path is its metadata.yaml."""
+def _bag_name(path: Path) -> str:
+    """The user's name of a bag: the name of its folder if the path is its metadata.yaml."""
     whole = path.resolve()
     return (whole.parent if whole.name == METADATA else whole).name
 
 
 def _sample_clouds(path: Path, bag: Bag, topic: Topic) -> list[Cloud]:
-    """The first clouds that have points.
+    """Read the first ``SAMPLED_CLOUDS`` clouds that have points.
 
     Raises:
-        InputError: none can be read, or none has points.
+        InputError: no cloud can be read, or none has points.
     """
     sample: list[Cloud] = []
-    clouds = _read(path, bag, topic, lambda message, _: read_cloud(message), Counter())
+    clouds = _read_messages(path, bag, topic, lambda message, _: read_cloud(message), Counter())
     try:
         sample.extend(islice((cloud for cloud in clouds if len(cloud.points)), SAMPLED_CLOUDS))
     except InputError:
@@ -199,7 +202,8 @@ def _sample_clouds(path: Path, bag: Bag, topic: Topic) -> list[Cloud]:
 
 
 def _first_frame(path: Path, bag: Bag, topic: Topic) -> str:
-    messages = _read(path, bag, topic, lambda message, _: str(message.header.frame_id), Counter())
+    """Name of the frame of the first scan."""
+    messages = _read_messages(path, bag, topic, lambda message, _: str(message.header.frame_id), Counter())
     return next(messages)
 
 
@@ -210,13 +214,13 @@ def _close_after(bag: Bag, scans: Iterator[Scan]) -> Iterator[Scan]:
         bag.close()
 
 
-def _read(
+def _read_messages(
     path: Path, bag: Bag, topic: Topic, convert: Callable[[Any, int], T], skipped: Counter[str]
 ) -> Iterator[T]:
-    """What becomes of each message of a topic that can be read.
+    """Decode and convert the messages of a topic; those that cannot be read are counted in ``skipped``.
 
     Raises:
-        InputError: the bag breaks off, or not one message can be read.
+        InputError: the bag is cut off or damaged, or no message can be read.
     """
     read, why = 0, ""
     try:
@@ -230,8 +234,8 @@ def _read(
             yield value
             read += 1
     except (BrokenBag, OSError) as error:
-        kept = "what came before is kept; " if read else ""
-        raise InputError(f"{path}: breaks off after {read} scans ({error}); {kept}{MENDED_BY}") from error
+        kept = "these scans are kept; " if read else ""
+        raise InputError(f"{path}: breaks off after {read} scans ({error}); {kept}{REPAIR_ADVICE}") from error
     if not read and skipped[UNREADABLE]:
         raise InputError(
             f"{path}: none of its {skipped[UNREADABLE]} messages of {topic.name} can be read ({why}); record "

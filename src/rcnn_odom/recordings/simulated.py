@@ -1,9 +1,9 @@
-"""Drives through generated worlds, seen by a 2D laser: no download, and never the same world twice.
+"""Simulated drives of a 2D laser through generated worlds; no download is needed.
 
-``street`` is a car with one ring of an HDL-64 in a city, its motion like KITTI's; ``indoor`` is a robot with
-a level scanner in a building; ``blind`` are places where the walls tell little of the way. A name stands for
-a world and a drive of its own, so ``05`` is always the same drive, but it has nothing in common with KITTI's
-05 except its name and, in full scale, its length.
+``street`` is a car with one ring of an HDL-64 in a city, with motion like KITTI's. ``indoor`` is a robot with
+a level scanner in a building. ``blind`` are places where scan matching has little information about the
+motion along the way. Each name is a world and a drive of its own: ``05`` is always the same drive, but has
+only its name and, in full scale, its length in common with KITTI's 05.
 """
 
 import hashlib
@@ -29,10 +29,10 @@ from rcnn_odom.simulation.sweep import poses_at, ring_times
 from rcnn_odom.simulation.worlds import FRAME_TIME, MINUTE_RATE, STRETCH, WORLDS, Recipe, poses_of, stamps_of
 
 VERSION = 4
-"""Counts changes of the generator: part of every fingerprint."""
+"""Increase it when the generator changes; it is part of every fingerprint."""
 
 LIBRARIES = [(name, version(name)) for name in ("numpy", "scipy", "numba")]
-"""Another version of these may draw other numbers from the same seed."""
+"""Other versions of these libraries may give other numbers for the same seed."""
 
 World = Literal["street", "indoor", "corridor", "few_returns", "standstill", "standstill_street", "blind"]
 Scale = Literal["small", "full"]
@@ -45,38 +45,39 @@ KITTI_FRAMES = dict(
     )
 )
 SCORED_FRAMES = 800
-"""Of a small drive that validates or tests: well over 400 m, so that drift has segments of 100 to 400 m."""
+"""Length of a small drive for validation or test: well over 400 m, so that drift has long segments."""
 FRAMES: dict[str, dict[str, int]] = {
     "full": KITTI_FRAMES,
     "small": {name: frames // 10 for name, frames in KITTI_FRAMES.items()}
     | dict.fromkeys(("05", "07", "10"), SCORED_FRAMES),
 }
 DEFAULT_FRAMES = 600
-"""Of a drive with another name."""
+"""Length of a drive with another name."""
 BLIND_FRAMES = 1800
-"""Of a drive of ``blind`` in either scale: three minutes, in which also a robot comes 100 m far."""
+"""Length of a drive of ``blind`` in both scales: three minutes, in which even a robot drives 100 m."""
 
 SENSORS: dict[str, dict[str, Any]] = {
     "street": {},
     "indoor": {"resolution_deg": 1.0, "field_of_view_deg": 180.0, "max_range": 40.0},
 }
-"""What the lasers of the worlds are like unless the caller says otherwise: KITTI's, and a SICK's."""
+"""Default lasers of the worlds: KITTI's on streets, and a SICK indoors."""
 
 LONGEST_RANGE = 80.0
+"""Metres; streets are only built for lasers that see no farther."""
 MIRROR_RATE_HZ = 75.0
-"""Turns a second of a laser that sees half the circle or less, of no other kind: a SICK's."""
+"""Turns per second, as of a SICK's mirror; for lasers without a kind that see at most half a circle."""
 ON_WHEELS = 3.0
-"""Metres that a laser moves in one of its turns at most."""
+"""Metres; largest motion of a laser during one of its turns."""
 
 MINUTE = 60.0
-"""Seconds of the drives that are special cases, whatever their names."""
+"""Seconds; duration of the drives of special cases, whatever their names."""
 
 STREETS = ("street", "standstill_street")
 
 
 @dataclass(kw_only=True)
 class RealismOptions:
-    """``data.realism``."""
+    """Options of ``data.realism``; see :func:`load`."""
 
     tilt: bool
     movers: bool
@@ -86,7 +87,7 @@ class RealismOptions:
 
 @dataclass(kw_only=True)
 class Options:
-    """What ``conf/data/simulated.yaml``, ``indoor.yaml`` and ``blind.yaml`` set beside what all data have."""
+    """Options of ``conf/data/simulated.yaml``, ``indoor.yaml`` and ``blind.yaml`` not common to all data."""
 
     realism: RealismOptions
     fresh_worlds: bool
@@ -96,7 +97,7 @@ class Options:
     scale: str = option(choices=("small", "full"))
     frames: int | None = option(above=0)
     world_seed: int = option(least=0, below=2**32, wanted="a whole number, not negative")
-    laser: LaserOptions = option(default=None)  # noqa: RUF009 - None stands for a run of before
+    laser: LaserOptions = option(default=None)  # noqa: RUF009 - older runs do not have this option
     turn_rate_deg_s: float | None = option(default=None, above=0)
     scan_rate_hz: float | None = option(default=None, above=0)
 
@@ -118,50 +119,56 @@ def load(
     turn_rate_deg_s: float | None = None,
     scan_rate_hz: float | None = None,
 ) -> Recording:
-    """A simulated drive: another world for every name and seed.
+    """Make a simulated drive; every name and seed give another world.
 
     Args:
         name: any name; the same name and seed always give the same drive. ``NAME~1``, ``NAME~2`` ... are
             other drives in other worlds, each as long as ``NAME``.
-        sensor: ``resolution_deg``, ``field_of_view_deg`` and ``max_range`` in metres; the others are
-            KITTI's, or indoors a SICK's. With a ``laser`` it says nothing of that.
-        world: ``street`` or ``indoor``; ``blind``, whose names begin with the kind of place: ``tunnel-``,
+        sensor: ``resolution_deg``, ``field_of_view_deg`` and ``max_range`` (metres) of the world's default
+            laser; those not given are KITTI's, or indoors a SICK's. Not used if ``laser`` is given.
+        world: ``street`` or ``indoor``; ``blind``, where names begin with the kind of place: ``tunnel-``,
             ``corridor-`` or ``posts-`` (see :mod:`rcnn_odom.simulation.blind.drive`); or a special case that
-            lasts a minute: ``corridor`` (two bare walls without an end), ``few_returns`` (a plain with some
-            posts), ``standstill`` (a robot at rest in a building) and ``standstill_street`` (a parked car,
-            without traffic).
-        scale: by which ``FRAMES`` says how long the drive of a name is.
-        frames: its length whatever its name; None: by scale and name.
-        seed: chooses the set of worlds, 0 or more.
-        movers: other cars and people move.
-        missing: some beams do not come back although there is something within range.
-        tilt: the car leans on its springs and the ground has slopes; a level laser still sways sideways.
-        skew: the laser moves while it turns, so that every beam starts from where it is then, and scans have
-            times. The pose is that of the stamp: of the first beam, or of an HDL-64's look straight ahead.
-            What moves besides stands still during a turn.
-        vary_pace: a car drives the drives ``NAME~1`` ... faster and slower than KITTI's; ``NAME`` never.
+            lasts a minute: ``corridor`` (two bare walls whose ends are out of sight), ``few_returns`` (a
+            plain with some posts), ``standstill`` (a robot at rest in a building) or ``standstill_street`` (a
+            parked car, without traffic).
+        scale: ``small`` or ``full``, which sets the length of a drive by its name: see ``FRAMES``.
+        frames: length of the drive, whatever its name; None: by scale and name.
+        seed: number of the set of worlds, 0 or more.
+        movers: whether other cars and people move.
+        missing: whether some beams get no return although something is within range.
+        tilt: whether the car pitches and rolls on its springs and the ground has slopes. Without it, a level
+            laser still sways sideways.
+        skew: whether the laser moves while it turns, so that beams start from different poses and scans have
+            times. The true pose is that at the stamp: at the first beam, or when an HDL-64 points ahead.
+            Other cars and people do not move during a turn.
+        vary_pace: whether the drives ``NAME~1`` ... on streets are faster and slower than KITTI's.
         laser: another laser: see :class:`rcnn_odom.simulation.kinds.LaserOptions`, for instance
-            ``{"kind": "sick", "spacing_deg": 0.5}``. All but an HDL-64 give all beams, inf for no return.
-        turn_rate_deg_s: of the robot indoors when it turns on the spot; None: its own.
-        scan_rate_hz: scans a second, but not in streets; None: the robot's own, in special cases 10.
+            ``{"kind": "sick", "spacing_deg": 0.5}``. All lasers but an HDL-64 give all beams, inf for no
+            return.
+        turn_rate_deg_s: degrees per second at which the robot indoors turns on the spot; None: a random rate.
+        scan_rate_hz: scans per second, not for streets; None: a random rate for ``indoor``, otherwise 10.
 
     Returns:
         The drive. Its scans are computed when they are read.
 
     Raises:
-        InputError: fewer than two frames, a negative seed, an unknown world or scale, too long a range, an
-            option of the laser that does not fit, or a rate that the world does not have.
+        InputError: there are fewer than two frames, the seed is negative, the world or scale is unknown, the
+            range is too long, an option of the laser does not fit, or the world does not have such a rate.
+
+    >>> drive = load("05", world="indoor", frames=3)
+    >>> drive.poses.shape, len(drive.read_scan(0).ranges) > 0
+    ((3, 4, 4), True)
     """
-    _check(name, world, scale, frames, seed)
+    _check_options(name, world, scale, frames, seed)
     _check_rates(name, world, turn_rate_deg_s, scan_rate_hz)
     if world == "blind":
         kind_of(name)
-    length = frames or _length(name, world, scale, scan_rate_hz)
+    length = frames or _count_frames(name, world, scale, scan_rate_hz)
     other_paces = vary_pace and world == "street" and "~" in name
     recipe = Recipe(name, seed, world, length, movers, tilt, other_paces, turn_rate_deg_s, scan_rate_hz)
-    reader = _reader(recipe, sensor or {}, laser or {}, missing, skew)
-    # Without what is None, options that came later, so that drives without them are still known by their key.
-    recipe_and_laser = asdict(reader, dict_factory=_without_none)
+    reader = _make_reader(recipe, sensor or {}, laser or {}, missing, skew)
+    # Options that are None are left out, so a new option does not change the fingerprints of other drives.
+    recipe_and_laser = asdict(reader, dict_factory=_drop_none)
     return Recording(
         name=name,
         poses=poses_of(recipe).copy(),
@@ -174,12 +181,12 @@ def load(
     )
 
 
-def _without_none(items: list[tuple[str, Any]]) -> dict[str, Any]:
+def _drop_none(items: list[tuple[str, Any]]) -> dict[str, Any]:
     return {key: value for key, value in items if value is not None}
 
 
-def _length(name: str, world: str, scale: str, scan_rate_hz: float | None) -> int:
-    """Frames of a drive."""
+def _count_frames(name: str, world: str, scale: str, scan_rate_hz: float | None) -> int:
+    """Number of frames of a drive."""
     if world == "blind":
         return BLIND_FRAMES
     if world in ("street", "indoor"):
@@ -187,7 +194,7 @@ def _length(name: str, world: str, scale: str, scan_rate_hz: float | None) -> in
     return round(MINUTE * (scan_rate_hz or MINUTE_RATE)) + 1
 
 
-def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> None:
+def _check_options(name: str, world: str, scale: str, frames: int | None, seed: int) -> None:
     kinds = f"{', '.join(WORLDS[:-1])} or {WORLDS[-1]}"
     for fits, advice in (
         (frames is None or frames >= 2, f"a drive has at least 2 frames, not {frames}; change data.frames"),
@@ -202,12 +209,12 @@ def _check(name: str, world: str, scale: str, frames: int | None, seed: int) -> 
 def _check_rates(name: str, world: str, turn_rate_deg_s: float | None, scan_rate_hz: float | None) -> None:
     if turn_rate_deg_s is not None and world != "indoor":
         raise InputError(
-            f"simulated sequence {name}: data.turn_rate_deg_s is of the robot of data.world=indoor; "
+            f"simulated sequence {name}: data.turn_rate_deg_s is only for the robot of data.world=indoor; "
             "leave it out"
         )
     if scan_rate_hz is not None and world in STREETS:
         raise InputError(
-            f"simulated sequence {name}: the laser of a car scans {1 / FRAME_TIME:g} times a second; "
+            f"simulated sequence {name}: the laser of a car always scans {1 / FRAME_TIME:g} times a second; "
             "leave out data.scan_rate_hz"
         )
     for option_name, rate in (("turn_rate_deg_s", turn_rate_deg_s), ("scan_rate_hz", scan_rate_hz)):
@@ -215,19 +222,19 @@ def _check_rates(name: str, world: str, turn_rate_deg_s: float | None, scan_rate
             raise InputError(f"simulated sequence {name}: data.{option_name}={rate:g}: must be above 0")
 
 
-def _reader(
+def _make_reader(
     recipe: Recipe, sensor: dict[str, Any], given: dict[str, Any], missing: bool, skew: bool
 ) -> "ScanReader":
-    """What looks at the world: with the laser that is asked for, or with the one that the world has."""
+    """Make the reader of scans, with the given laser or with the default laser of the world."""
     chosen = choose_laser(given)
     if chosen is None:
-        chosen = _own_laser(recipe.name, recipe.world, sensor, skew)
+        chosen = _default_laser(recipe.name, recipe.world, sensor, skew)
     laser, beams, rate = chosen
     if recipe.world in STREETS and laser.max_range > LONGEST_RANGE:
         group = "laser" if given.get("kind") else "sensor"
         raise InputError(
             f"simulated sequence {recipe.name}: the streets are drawn for lasers that see {LONGEST_RANGE:g} "
-            f"m; lower data.{group}.max_range, {laser.max_range:g}"
+            f"m; lower data.{group}.max_range, which is {laser.max_range:g}"
         )
     if not skew:
         return ScanReader(recipe, laser, missing, beams)
@@ -235,13 +242,13 @@ def _reader(
     return ScanReader(recipe, laser, missing, beams, rate or 1 / frame_time)
 
 
-def _own_laser(
+def _default_laser(
     name: str, world: str, given: dict[str, Any], skew: bool
 ) -> tuple[Laser, EvenBeams | None, float | None]:
-    """The laser that a world has unless told otherwise, in the form of ``choose_laser``."""
+    """The default laser of a world, in the form of ``choose_laser``'s result."""
     if given.get("facing_deg") and given.get("field_of_view_deg") != 360:
         raise InputError(
-            f"simulated sequence {name}: its laser looks ahead; leave out data.sensor.facing_deg"
+            f"simulated sequence {name}: its laser always faces ahead; leave out data.sensor.facing_deg"
         )
     if world in STREETS:
         return hdl64_ring(given.get("max_range", LONGEST_RANGE)), None, None
@@ -249,33 +256,34 @@ def _own_laser(
     level = default | {key: value for key, value in given.items() if key in default}
     if not skew:
         return scanner(**level), None, None
-    # Which beam comes when is plain only where all of them are given.
+    # The times of the beams are known only if the scan holds all beams.
     beams = EvenBeams(level["resolution_deg"], level["field_of_view_deg"])
     return scanner(**level), beams, MIRROR_RATE_HZ if beams.field_of_view_deg <= 180 else None
 
 
 @dataclass(frozen=True)
 class ScanReader:
-    """Looks at a world from the poses of a drive: the ``read_scan`` of a simulated sequence.
+    """Computes the scans of a drive through a world: the ``read_scan`` of a simulated sequence.
 
-    It holds the recipe only. The world is built by whichever process reads the first scan, and kept.
+    It holds only the recipe of the world. Each process builds the world when it reads its first scan, and
+    keeps it.
     """
 
     recipe: Recipe
     laser: Laser
     missing: bool
     beams: EvenBeams | None = None
-    """Those of a laser that gives all of them; None: returns alone."""
+    """Beams of a laser whose scans hold all beams; None: scans hold only returns."""
     rate_hz: float | None = None
-    """Turns a second of a laser that moves meanwhile; None: it looks everywhere at once."""
+    """Turns per second of a laser that moves while it turns; None: all beams are measured at once."""
 
     def points(self, frame: int) -> npt.NDArray[np.float32]:
-        """(P, 4) x, y, z in metres in the laser's frame and reflectance 0: a KITTI file."""
+        """Points (P, 4) as in a KITTI file: x, y, z in metres in the laser's frame, and reflectance 0."""
         bearings, ranges, _ = self._shots(range(self.recipe.frames)[frame])
         return self.laser.points(bearings, ranges)
 
     def __call__(self, frame: int) -> Scan:
-        """All beams, or those that came back with their ranges horizontal."""
+        """The scan of a frame: all beams, or only the returns with their horizontal ranges."""
         frame = range(self.recipe.frames)[frame]
         stamp = float(stamps_of(self.recipe)[frame])
         bearings, ranges, times = self._shots(frame)
@@ -285,7 +293,10 @@ class ScanReader:
         return scan if times is None else replace(scan, times=times[np.isfinite(ranges)])
 
     def _shots(self, frame: int) -> tuple[FloatArray, FloatArray, FloatArray | None]:
-        """Bearings, ranges and, of a laser that moves while it turns, times of all shots (B,)."""
+        """Bearings (radians) and ranges (metres) of all shots (B,), and their times in seconds.
+
+        The times are None if all beams are measured at once.
+        """
         rng = self.recipe.generator(worlds.SCAN, frame)
         bearings = self.laser.azimuths(rng) if self.beams is None else self.beams.bearings(frame)
         poses, stamps = poses_of(self.recipe), stamps_of(self.recipe)
@@ -302,6 +313,6 @@ class ScanReader:
 
 
 def roads_of(drive: Recording) -> Roads:
-    """What kind of roads a street drive goes along."""
+    """The kind of roads of a drive on streets."""
     assert isinstance(drive.read_scan, ScanReader)
     return worlds.roads_of(drive.read_scan.recipe)

@@ -1,4 +1,4 @@
-"""Scans one after the other, for an odometer: one interface for all streaming formats."""
+"""A stream of scans: one interface for all streaming formats."""
 
 from collections import Counter
 from collections.abc import Iterator
@@ -12,18 +12,18 @@ from rcnn_odom.recordings.scan import Scan
 
 @dataclass
 class ScanStream:
-    """A recording or a live source, none of it held in memory.
+    """A recording or a live source, read scan by scan.
 
     Attributes:
-        name: as a user would name it.
-        scans: in their order. Raises InputError where it breaks off.
-        total: how many scans there are, if that is known.
-        has_clock: the stamps tell of order and gaps; otherwise the order alone counts.
-        beams: of the laser, where its scans are returns alone; None: as the bearings of a scan say.
-        camera_from_laser: (4, 4), the frame in which trajectories are written.
-        notes: what the reader noticed, in words for the user.
-        skipped: what could not be read and was passed over, counted while ``scans`` is read.
-        is_compensated: the motion of the laser during a revolution has been taken out of its points already.
+        name: the user's name of the recording.
+        scans: the scans in order; raises InputError if the source is cut off or damaged.
+        total: number of scans; None: unknown.
+        has_clock: whether the stamps show order and gaps of the scans; otherwise only their order is used.
+        beams: beams of the laser if its scans are returns alone; None: the bearings of the scans show them.
+        camera_from_laser: (4, 4), to the frame in which trajectories are written.
+        notes: messages of the reader for the user.
+        skipped: number of items that could not be read, by kind; counted while ``scans`` is read.
+        is_compensated: whether the motion of the laser during a revolution is already removed from the scans.
         laser_pose: x and y in metres and heading in radians of the laser on the robot; None: unknown.
     """
 
@@ -40,10 +40,10 @@ class ScanStream:
 
 
 def thin(stream: ScanStream, every: int) -> ScanStream:
-    """The first scan of a stream and every ``every``-th after it.
+    """Keep the first scan of a stream and every ``every``-th scan after it.
 
     Args:
-        stream: read through the one that is returned from now on.
+        stream: the stream; do not read it yourself afterwards.
         every: 1 or more; 1: all scans.
     """
     assert every > 0, every

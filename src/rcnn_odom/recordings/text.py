@@ -1,4 +1,4 @@
-"""Text of recordings: unpacked and decoded, without the byte order mark that some programs begin it with."""
+"""Reads text files: decompressed, decoded, and without the byte order mark that some programs write."""
 
 import codecs
 import io
@@ -9,14 +9,14 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.recordings.packing import HEAD, open_unpacked, read_head, unpacking_errors
 
 MARK = "\ufeff"
-"""The byte order mark. It is skipped at the start of any line, since files are also joined together."""
+"""The byte order mark. It is removed from the start of each line, because files may have been joined."""
 
 
 def need_text(path: Path) -> bytes:
-    """The first bytes of a text file, unpacked and without a byte order mark.
+    """The first bytes of a text file after decompression, without a byte order mark.
 
     Raises:
-        InputError: it cannot be read or unpacked, is empty, or is text in UTF-16 or UTF-32.
+        InputError: the file cannot be read or decompressed, is empty, or is text in UTF-16 or UTF-32.
     """
     head = read_head(path)
     refuse_utf16(path, head)
@@ -27,14 +27,18 @@ def need_text(path: Path) -> bytes:
 
 
 def refuse_utf16(path: str | Path, head: bytes) -> None:
-    """Refuses a text in UTF-16 or UTF-32, of which a reader of UTF-8 understands no word.
+    """Check that a text is not in UTF-16 or UTF-32, because it is read as UTF-8.
+
+    Args:
+        path: path of the file, for the error.
+        head: first bytes of the file.
 
     Raises:
-        InputError: the first bytes of the file are such a text.
+        InputError: the first bytes are text in UTF-16 or UTF-32.
     """
     marked = head.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) and b"\0" in head
     every_other_is_zero = any(head) and (not any(head[::2]) or not any(head[1::2]))
-    # The mark of UTF-16 also begins that of UTF-32, whose letters leave two bytes in the middle at zero.
+    # The mark of UTF-32 begins with that of UTF-16. In UTF-32, most characters have two zeros in the middle.
     if head.startswith((codecs.BOM_UTF32_LE, codecs.BOM_UTF32_BE)) or (
         len(head) > 3 and any(head) and not any(head[1::4] + head[2::4])
     ):
@@ -44,14 +48,14 @@ def refuse_utf16(path: str | Path, head: bytes) -> None:
 
 
 def lines_of(path: Path) -> Iterator[tuple[int, str]]:
-    """The lines of a text file, unpacked, and their numbers from 1 on.
+    """Yield the numbers (from 1 on) and texts of the lines of a file, which may be compressed.
 
     Raises:
-        InputError: it cannot be read or unpacked to its end.
+        InputError: the file cannot be read or decompressed to its end.
     """
     with open_unpacked(path) as file:
         try:
-            # A byte that is no text becomes a character that is no number, and then an error with its line.
+            # An invalid byte becomes a replacement character; the parser then reports its line.
             text = io.TextIOWrapper(file, encoding="utf-8", errors="replace")
             for number, line in enumerate(text, start=1):
                 yield number, line.lstrip(MARK)

@@ -1,6 +1,6 @@
-"""Trajectory files: KITTI and TUM text formats, and motions as CSV; camera poses flattened to a plane.
+"""Reads and writes trajectories in KITTI's and TUM's text formats, and motions as CSV.
 
-Poses here are (N, 4, 4) from the camera's frame (x right, y down, z forward) to a fixed frame.
+Poses are (N, 4, 4) from the camera's frame (x right, y down, z forward) to a fixed frame.
 """
 
 import re
@@ -18,26 +18,30 @@ from rcnn_odom.recordings.text import refuse_utf16
 
 
 def file_name(sequence: str) -> str:
-    """A sequence's name as it stands in names of files: ``c[0.5:]`` becomes ``c_0.5-``."""
+    """Turn the name of a sequence into a file name.
+
+    >>> file_name("c[0.5:]")
+    'c_0.5-'
+    """
     return re.sub(r"[^\w.-]+", "_", sequence.replace(":", "-")).strip("_")
 
 
 def read_kitti(path: str | Path) -> FloatArray:
-    """Read a KITTI trajectory: a line for each frame, the upper 3x4 of the pose, row by row.
+    """Read a KITTI trajectory: a line for each frame with the upper 3x4 part of the pose, row by row.
 
     Args:
-        path: text file of 12 numbers a line; blank lines are allowed at the end only.
+        path: text file of 12 numbers a line; blank lines are allowed only at the end.
 
     Returns:
         Poses (N, 4, 4), N >= 1, translations in metres.
 
     Raises:
-        InputError: the file cannot be read or is empty, or a line (which is named) does not hold
+        InputError: the file cannot be read or is empty, or a line (named in the message) does not hold
             12 finite numbers with a rotation among them.
     """
     lines = read_lines(path, "give a file with 12 numbers a line, one line a frame")
     rows = [
-        numbers(f"{path}:{number}", line.split(), 12, "a KITTI pose has 12 finite numbers")
+        parse_numbers(f"{path}:{number}", line.split(), 12, "a KITTI pose has 12 finite numbers")
         for number, line in enumerate(lines, start=1)
     ]
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
@@ -52,14 +56,14 @@ def read_kitti(path: str | Path) -> FloatArray:
 
 
 def read_lines(path: str | Path, wanted: str) -> list[str]:
-    """The lines of a text file, one at least.
+    """Read the lines of a text file, at least one.
 
     Args:
-        path: of the file.
-        wanted: what it should be, for the message.
+        path: path of the file.
+        wanted: advice for the error message.
 
     Raises:
-        InputError: it cannot be read, is empty, is text in UTF-16, or a pointer of Git LFS.
+        InputError: the file cannot be read, is empty, is text in UTF-16 or UTF-32, or is a Git LFS pointer.
     """
     try:
         content = Path(path).read_bytes()
@@ -73,17 +77,20 @@ def read_lines(path: str | Path, wanted: str) -> list[str]:
     return lines
 
 
-def numbers(where: str, words: list[str], count: int, wanted: str) -> list[float]:
-    """The words of a line as so many finite numbers.
+def parse_numbers(where: str, words: list[str], count: int, wanted: str) -> list[float]:
+    """Convert the words of a line to finite numbers.
 
     Args:
-        where: file and line, for the message.
-        words: of the line.
-        count: numbers that it must hold.
-        wanted: a sentence that says so.
+        where: file and line, for the error message.
+        words: words of the line.
+        count: required number of words.
+        wanted: a sentence that says what the line must hold, for the error message.
 
     Raises:
-        InputError: they are none, or another number of them.
+        InputError: a word is not a finite number, or there is another number of words.
+
+    >>> parse_numbers("file:1", ["1", "2.5"], 2, "a line has 2 numbers")
+    [1.0, 2.5]
     """
     try:
         if len(words) != count:
@@ -97,8 +104,8 @@ def numbers(where: str, words: list[str], count: int, wanted: str) -> list[float
 
 
 def is_rotation(matrix: FloatArray) -> bool:
-    """Whether a matrix (3, 3) of finite numbers turns without stretching, to a hundredth."""
-    # Large numbers first: their determinant would overflow.
+    """Whether a matrix (3, 3) of finite numbers is a rotation, within a tolerance of 0.01."""
+    # Large numbers are excluded first, because their determinant would overflow.
     return bool((np.abs(matrix) < 1.01).all()) and abs(np.linalg.det(matrix) - 1) < 0.01
 
 
@@ -109,7 +116,7 @@ def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
         Stamps (N,) in seconds and poses (N, 4, 4).
 
     Raises:
-        InputError: the file cannot be read or is empty, or a line (which is named) does not hold eight
+        InputError: the file cannot be read or is empty, or a line (named in the message) does not hold eight
             finite numbers with a quaternion of unit length among them.
     """
     from scipy.spatial.transform import Rotation
@@ -128,33 +135,39 @@ def read_tum(path: str | Path) -> tuple[FloatArray, FloatArray]:
 
 
 def read_numbers(path: str | Path, columns: int, wanted: str) -> FloatArray:
-    """Lines of so many numbers as rows (N, columns), N >= 1; lines that begin with # are comments.
+    """Read a table of numbers from a text file; lines that begin with # are comments.
 
     Args:
-        path: of the text file.
-        columns: numbers a line.
-        wanted: what a line should hold, for the message.
+        path: path of the text file.
+        columns: number of columns.
+        wanted: what a line must hold, for the error message.
+
+    Returns:
+        Rows (N, columns), N >= 1.
 
     Raises:
-        InputError: the file cannot be read or holds no line, or a line (which is named) does not hold so
-            many finite numbers.
+        InputError: the file cannot be read or holds no row, or a line (named in the message) does not hold
+            ``columns`` finite numbers.
     """
     rows = [
-        numbers(f"{path}:{number}", line.split(), columns, wanted)
+        parse_numbers(f"{path}:{number}", line.split(), columns, wanted)
         for number, line in enumerate(read_lines(path, wanted), start=1)
         if not line.startswith("#")
     ]
     if not rows:
-        raise InputError(f"{path}: has comments alone; {wanted}")
+        raise InputError(f"{path}: has only comments; {wanted}")
     return np.array(rows)
 
 
 def write_kitti(path: str | Path | TextIO, poses: npt.ArrayLike) -> None:
-    """Write poses (N, 4, 4) in KITTI's format, in full precision: `read_kitti` returns the same numbers.
+    """Write poses in KITTI's format, in full precision: `read_kitti` returns the same numbers.
 
-    Rounding would matter more than it seems: at a constant speed a distance may equal a segment's
-    length, and the last digit then decides where the segment ends. Into a file that is open the lines are
-    added.
+    Rounding could change the drift: at a constant speed, a distance may equal a segment's length exactly, and
+    then the last digit decides where the segment ends.
+
+    Args:
+        path: text file to write, or an open file to which the lines are appended.
+        poses: (N, 4, 4), translations in metres.
 
     Raises:
         ValueError: ``poses`` has another shape.
@@ -167,12 +180,12 @@ def write_tum(path: str | Path | TextIO, stamps: npt.ArrayLike, poses: npt.Array
     """Write lines of ``stamp x y z qx qy qz qw``, the format of the TUM RGB-D benchmark.
 
     Args:
-        path: text file to write, or one that is open for writing and gets more lines.
+        path: text file to write, or an open file to which the lines are appended.
         stamps: times (N,) in seconds.
-        poses: (N, 4, 4), translations in metres. The frame is kept: camera poses stay camera poses.
+        poses: (N, 4, 4), translations in metres. They are not transformed: camera poses stay camera poses.
 
     Raises:
-        ValueError: the shapes do not fit.
+        ValueError: the shapes do not fit each other.
     """
     poses = _check_shape(poses)
     stamps = np.asarray(stamps, dtype=np.float64)
@@ -185,8 +198,8 @@ def write_tum(path: str | Path | TextIO, stamps: npt.ArrayLike, poses: npt.Array
 def _quaternions(rotations: FloatArray) -> FloatArray:
     """Unit quaternions (N, 4) in the order x, y, z, w with w >= 0, of rotations (N, 3, 3).
 
-    Bar-Itzhack 2000: the eigenvector of the largest eigenvalue. Unlike the formula that divides by
-    the trace it has no weak spot at half turns, and bears rounded matrices.
+    Method of Bar-Itzhack (2000): the eigenvector of the largest eigenvalue. Unlike the formula that divides
+    by the trace, it is stable at half turns, and tolerates rounded matrices.
     """
     (xx, xy, xz), (yx, yy, yz), (zx, zy, zz) = np.moveaxis(rotations, 0, -1)
     rows = [
@@ -200,19 +213,22 @@ def _quaternions(rotations: FloatArray) -> FloatArray:
 
 
 def flatten(poses: npt.ArrayLike) -> FloatArray:
-    """Project camera poses on the x-z plane: x, z and the heading about y stay.
+    """Project camera poses onto the x-z plane: x, z and the heading about y remain.
 
     The heading is the direction of the forward axis (third column) in the plane; height, pitch and
     roll are dropped.
 
     Args:
-        poses: (N, 4, 4), camera frame.
+        poses: (N, 4, 4), in the camera's frame.
 
     Returns:
-        Planar poses (N, 4, 4) with y = 0 and rotations about y alone.
+        Planar poses (N, 4, 4) with y = 0 and rotations only about y.
 
     Raises:
         ValueError: ``poses`` has another shape.
+
+    >>> flatten(np.eye(4)[None]).shape
+    (1, 4, 4)
     """
     poses = _check_shape(poses)
     heading = np.arctan2(poses[:, 0, 2], poses[:, 2, 2])
@@ -234,13 +250,13 @@ def _check_shape(poses: npt.ArrayLike) -> FloatArray:
 def write_motions(
     path: str | Path, motions: FloatArray, truth: FloatArray, baselines: Mapping[str, FloatArray]
 ) -> None:
-    """Write CSV with a line for each motion, under the number of its later scan, in full precision.
+    """Write a CSV file with a line for each motion, in full precision; ``frame`` is that of its later scan.
 
     Args:
         path: file to write.
-        motions: estimated, (N, 2) metres and radians.
-        truth: (N, 2).
-        baselines: (N, 2) by the name of the method, which goes before the names of its columns.
+        motions: (N, 2) estimated distances in metres and heading changes in radians.
+        truth: (N, 2) true ones.
+        baselines: (N, 2) those of other methods, by the name of the method, which begins the column names.
     """
     rows = np.column_stack([np.arange(1, len(truth) + 1), motions, truth, *baselines.values()])
     formats = ["%d"] + ["%.17g"] * (rows.shape[1] - 1)
@@ -254,13 +270,13 @@ def _motion_columns(baselines: Iterable[str]) -> list[str]:
 
 
 def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
-    """Read what :func:`write_motions` wrote.
+    """Read a file of :func:`write_motions`.
 
     Returns:
-        The truth (N, 2), N >= 1, and motions (N, 2) by method, the first one called ``estimate``.
+        The truth (N, 2), N >= 1, and motions (N, 2) by method; the first method is ``estimate``.
 
     Raises:
-        InputError: the file cannot be read, has another header or no motion, or a line (which is named)
+        InputError: the file cannot be read, has another header or no motion, or a line (named in the message)
             is not the next frame with a finite number in each column.
     """
     lines = read_lines(path, "give a file of motions, as evaluate.py writes them")
@@ -270,7 +286,7 @@ def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
     if header != _motion_columns(baselines) or len(set(methods)) < len(methods):
         raise InputError(
             f"{path}:1: the header must be {','.join(_motion_columns([]))}, then "
-            "METHOD_distance_m,METHOD_heading_rad for each other method, if any"
+            "METHOD_distance_m,METHOD_heading_rad for each other method"
         )
     if len(lines) == 1:
         raise InputError(f"{path}: has no motion under its header: give a file with one line a frame")
@@ -281,7 +297,7 @@ def read_motions(path: str | Path) -> tuple[FloatArray, dict[str, FloatArray]]:
 
 def _parse_motions(line: str, frame: int, columns: int, path: str | Path) -> list[float]:
     where, fields = f"{path}:{frame + 1}", line.split(",")
-    number, *motions = numbers(where, fields, columns, f"a line has {columns} finite numbers here")
+    number, *motions = parse_numbers(where, fields, columns, f"a line has {columns} finite numbers here")
     if number != frame:
-        raise InputError(f"{where}: frame {fields[0]} where {frame} comes: frames count 1, 2, 3, ...")
+        raise InputError(f"{where}: frame {fields[0]} in place of {frame}: frames count 1, 2, 3, ...")
     return motions

@@ -1,4 +1,4 @@
-"""Numbered files of a Velodyne's points, one file a frame, as scans of one beam: both of KITTI's layouts."""
+"""Reads numbered files of a Velodyne's points, one file a frame, as scans of one beam (KITTI's layouts)."""
 
 import os
 from collections.abc import Iterable
@@ -10,7 +10,7 @@ import numpy as np
 from rcnn_odom.errors import InputError
 from rcnn_odom.geometry import FloatArray
 from rcnn_odom.recordings.beams import Beams
-from rcnn_odom.recordings.laser_frame import cone_spread, describe_steepness, find_rise, lowered
+from rcnn_odom.recordings.laser_frame import cone_spread, describe_steepness, find_rise, lower_points
 from rcnn_odom.recordings.packing import refuse_pointer
 from rcnn_odom.recordings.scan import Scan
 from rcnn_odom.recordings.trajectory import read_lines
@@ -31,34 +31,36 @@ from rcnn_odom.recordings.velodyne import (
 
 POINT_BYTES = 16
 LARGEST_POINTER = 1024
-"""Bytes of a pointer of Git LFS, at most."""
+"""Largest size of a Git LFS pointer, in bytes."""
 VELODYNE = Beams(first=-180.0, covered=360.0, spacing=0.18)
-TURNS = -1
-"""The laser turns clockwise as seen from above; a stamp is of the moment when it looks ahead."""
+TURN_DIRECTION = -1
+"""The laser turns clockwise as seen from above; the stamp of a frame is the time when it points ahead."""
 TURN = 0.1
-"""Seconds of a turn where no file tells it."""
+"""Seconds of a turn, if the files do not show it."""
 SHORTEST_TURN, LONGEST_TURN = 0.02, 0.5
-"""Seconds: what lies outside is no turn."""
+"""Seconds; other durations of a turn are taken to be wrong."""
 SAMPLED_FRAMES = 20
+"""Number of frames from which the ring or beam is chosen."""
 FRAMES_OF_BEAM = 5
-"""So many frames tell where a beam lies whose points come in any order."""
+"""Number of frames from which the elevation of a beam is found, if points are in any order."""
 FEWEST_POINTS = 30
-"""A frame with fewer is blank: that it lacks the beam says nothing about it."""
+"""A frame with fewer points is blank: it may lack the beam."""
 MOST_SPREAD = np.deg2rad(0.5)
-"""Of a ring about its cone; KITTI's rings near level have 0.02 degrees."""
+"""Largest spread of a ring about its cone; KITTI's rings near level have 0.02 degrees."""
 MOST_REFLECTANCE = 2**16
 MOST_ODD = 0.01
-"""Part of the points whose reflectance may be none."""
+"""Largest part of the points with an impossible reflectance."""
 
 Scans = dict[int, os.DirEntry[str]]
-"""Files by the numbers of their frames."""
+"""Files by their frame numbers."""
 
 
 def list_numbered(folder: Path, suffix: str) -> Scans:
-    """The files of a folder that are called NUMBER and the suffix, their sizes checked; hidden ones left out.
+    """List the files of a folder whose names are a number and the suffix; hidden files are left out.
 
     Raises:
-        InputError: a file has no number or another one's, or is empty, cut off or of other points.
+        InputError: the name of a file with the suffix is not a number, two files have the same number, or the
+            size of a file shows that it is empty, cut off or has other points.
     """
     found: Scans = {}
     for entry in sorted(os.scandir(folder), key=lambda entry: entry.name):
@@ -91,20 +93,21 @@ def _fault_of_size(size: int, suffix: str) -> str | None:
 
 
 def file_key(scans: Scans) -> str:
-    """Changes with any of the files."""
+    """A key that changes with the name, size or time of any file."""
     return "\n".join(f"{e.name} {e.stat().st_size} {e.stat().st_mtime_ns}" for e in scans.values())
 
 
 def read_points(path: str | Path) -> Points:
-    """The returns of a frame, (P, 4 as a rule) float32 metres.
+    """Read the returns of a frame: (P, 4) float32, or (P, 3 or more) from a text file; metres.
 
-    What is not finite, absurdly far or at the origin is left out: so drivers write missing returns.
+    Points that are not finite, extremely far or at the origin are left out: drivers write them for missing
+    returns.
 
     Args:
-        path: ``.bin``, four 32-bit floats a point, or ``.txt``, a line ``x y z reflectance`` for each.
+        path: ``.bin`` with four 32-bit floats a point, or ``.txt`` with a line ``x y z reflectance`` a point.
 
     Raises:
-        InputError: it cannot be read, or a line (which is named) holds something else.
+        InputError: the file cannot be read, or a line (named in the message) is not a point.
     """
     if Path(path).suffix == ".txt":
         points = _read_text(path)
@@ -117,7 +120,7 @@ def read_points(path: str | Path) -> Points:
         raise InputError(f"{path}: changed while it was in use, now cut off; download it again")
     points = values.reshape(-1, 4)
     if values.max() < FARTHEST and values.min() > -FARTHEST:
-        return _without_origin(points)  # the usual file, seen in a tenth of the time
+        return _without_origin(points)  # the usual file; this check takes a tenth of the time
     return _without_origin(points[(np.abs(points[:, :3]) < FARTHEST).all(1)])
 
 
@@ -135,15 +138,15 @@ def _read_text(path: str | Path) -> FloatArray:
     except ValueError as error:
         for number, line in enumerate(lines, start=1):
             if line.strip() and not _is_point(line, len(lines[0].split())):
-                raise InputError(f"{path}:{number}: {_no_point(line)}") from error
-        raise InputError(f"{path}: its lines are no points ({error}); download it again") from error
+                raise InputError(f"{path}:{number}: {_describe_fault(line)}") from error
+        raise InputError(f"{path}: its lines are not points ({error}); download it again") from error
     if points.shape[1] < 3:
-        raise InputError(f"{path}:1: {_no_point(lines[0])}")
+        raise InputError(f"{path}:1: {_describe_fault(lines[0])}")
     return points
 
 
-def _no_point(line: str) -> str:
-    return f"'{line.strip()[:40]}' is no point, x y z reflectance; correct the line"
+def _describe_fault(line: str) -> str:
+    return f"'{line.strip()[:40]}' is not a point, x y z reflectance; correct the line"
 
 
 def _is_point(line: str, columns: int) -> bool:
@@ -156,13 +159,16 @@ def _is_point(line: str, columns: int) -> bool:
 def choose_beam(
     paths: Iterable[str | Path], stamps: FloatArray, ring: int | None, turns: FloatArray | None = None
 ) -> tuple["BeamReader", tuple[str, ...]]:
-    """The reader of one beam for all frames, and words about it.
+    """Choose a beam from a sample of the frames.
 
     Args:
-        paths: of the frames, at least one.
-        stamps: (N,) seconds, when the laser looked ahead.
-        ring: which of the lasers, 0 the first in the file. None: the most level one, see ``LEVEL``.
+        paths: files of the frames, at least one.
+        stamps: (N,) seconds, when the laser pointed ahead.
+        ring: number of the laser in the files, counted from 0. None: the most level one, see ``LEVEL``.
         turns: (N,) seconds that each turn took; None: ``TURN``.
+
+    Returns:
+        The reader of the beam for all frames, and notes about the beam.
 
     Raises:
         InputError: a file cannot be read, there is no such ring, or none near level; or the points are not
@@ -172,49 +178,49 @@ def choose_beam(
     frames = np.unique(np.linspace(0, len(files) - 1, SAMPLED_FRAMES).round().astype(int))
     clouds = _without_blank([read_points(files[frame]) for frame in frames])
     if not clouds:
-        raise InputError(f"{files[0]}: neither it nor the other frames have a point; download them again")
+        raise InputError(f"{files[0]}: neither this nor the other frames have a point; download them again")
     if files[0].endswith(".bin"):
         _check_reflectance(clouds, files[0])
     if ring is None and (fault := describe_steepness(clouds)):
-        raise InputError(f"{files[0]}: {fault}; give them in the laser's, x ahead and z up")
+        raise InputError(f"{files[0]}: {fault}; give them in the laser's frame, x ahead and z up")
     split = [split_rings(cloud) for cloud in clouds]
     ringed = [rings for rings in split if rings is not None]
     if 2 * len(ringed) < len(clouds):
         disordered = [cloud for cloud, rings in zip(clouds, split, strict=True) if rings is None]
-        reader, notes = _by_elevation(files, stamps, ring, disordered)
+        reader, notes = _choose_by_elevation(files, stamps, ring, disordered)
     else:
-        reader, notes = _by_ring(files, stamps, ring, ringed, len(clouds))
+        reader, notes = _choose_by_ring(files, stamps, ring, ringed, len(clouds))
     return reader if turns is None else replace(reader, turns=tuple(turns.tolist())), notes
 
 
-def _by_ring(
+def _choose_by_ring(
     files: tuple[str, ...], stamps: FloatArray, ring: int | None, ringed: list[list[Points]], sampled: int
 ) -> tuple["BeamReader", tuple[str, ...]]:
     rise = find_rise(points for rings in ringed for points in rings)
-    ringed = [[lowered(points, rise) for points in rings] for rings in ringed]
+    ringed = [[lower_points(points, rise) for points in rings] for rings in ringed]
     elevations = _ring_elevations(ringed)
     chosen, elevation = _choose_ring(elevations, ring, files[0])
     usual = [rings[chosen] for rings in ringed if len(rings) == len(elevations) and len(rings[chosen])]
     beam = fit_beam(np.concatenate(usual)) if usual else Beam(elevation)
-    # A laser with a single beam may be tilted as a whole: there is no other ring that it could be taken for.
+    # A laser with a single beam may be tilted: it has no other ring with which this one could be confused.
     if ring is None and len(elevations) > 1 and usual and (spread := cone_spread(usual)) > MOST_SPREAD:
         raise InputError(
             f"{files[0]}: the points of ring {chosen} lie {np.rad2deg(spread):.1f} degrees from their cone, "
-            "so they are not in the laser's frame; give them in it, or, if it is the ring, set "
-            f"data.ring={chosen} (of rcnn-odom run: --ring {chosen})"
+            "so they are not in the laser's frame; give them in that frame, or, if the ring is right, set "
+            f"data.ring={chosen} (with rcnn-odom run: --ring {chosen})"
         )
     notes = [f"ring {chosen} of the Velodyne, median elevation {np.rad2deg(elevation):+.2f} degrees"]
     if rise:
-        notes.append(f"the points were raised: beams meet at {rise:+.2f} m, and rings are told from there")
+        notes.append(f"points were shifted along z: beams meet at {rise:+.2f} m; elevations are from there")
     if others := sampled - len(ringed):
         notes.append(
-            f"points of {others} in {sampled} frames are not laser by laser; their ring is taken by elevation"
+            f"points of {others} in {sampled} frames are not laser by laser; their ring is found by elevation"
         )
     return BeamReader(files, tuple(stamps.tolist()), beam, chosen, elevation, rise), tuple(notes)
 
 
 def _without_blank(clouds: list[Points]) -> list[Points]:
-    """The clouds that have about as many points as the others, at least one."""
+    """The clouds with at least a point, and at least 1 % of the points of the largest cloud."""
     most = max(map(len, clouds))
     return [cloud for cloud in clouds if len(cloud) > 0 and 100 * len(cloud) >= most]
 
@@ -224,34 +230,34 @@ def _check_reflectance(clouds: list[Points], path: str) -> None:
     odd = np.mean((values < 0) | (values > MOST_REFLECTANCE))
     if odd > MOST_ODD:
         raise InputError(
-            f"{path}: not four 32-bit floats a point (x y z reflectance): the fourth is no reflectance in "
-            f"{100 * odd:.0f} % of them; convert the files"
+            f"{path}: not four 32-bit floats a point (x y z reflectance): the fourth cannot be a reflectance "
+            f"in {100 * odd:.0f} % of them; convert the files"
         )
 
 
-def _by_elevation(
+def _choose_by_elevation(
     files: tuple[str, ...], stamps: FloatArray, ring: int | None, clouds: list[Points]
 ) -> tuple["BeamReader", tuple[str, ...]]:
     if ring is not None:
         raise InputError(
             f"{files[0]}: its points do not come laser by laser, so there is no ring {ring}; leave out "
-            "data.ring (of rcnn-odom run: --ring) for the most level beam"
+            "data.ring (with rcnn-odom run: --ring) for the most level beam"
         )
     clouds = clouds[:: -(-len(clouds) // FRAMES_OF_BEAM)]
     try:
         beam = find_level_beam(clouds)
     except ValueError as error:
         raise InputError(
-            f"{files[0]}: its points do not come laser by laser, and {error}; give the points as the laser "
-            "gave them, all of them and in its own frame"
+            f"{files[0]}: its points do not come laser by laser, and {error}; give all points as the laser "
+            "measured them, in its own frame"
         ) from error
     beams = [points_at(cloud, *beam) for cloud in clouds]
     elevation = np.rad2deg(median_elevation(np.concatenate(beams)))
-    notes = [f"points are not laser by laser; the beam at {elevation:+.2f} degrees is taken by elevation"]
+    notes = [f"points are not laser by laser; the beam at {elevation:+.2f} degrees is found by elevation"]
     if are_thinned(beams):
         notes.append(
-            "points are thinned to a grid: scan matching bears that, but paths of networks that were trained "
-            "on all points come out 10 % short and more"
+            "points are thinned to a grid: scan matching tolerates that, but networks that were trained on "
+            "all points give paths that are 10 % or more too short"
         )
     return BeamReader(files, tuple(stamps.tolist()), beam), tuple(notes)
 
@@ -259,43 +265,43 @@ def _by_elevation(
 def _choose_ring(elevations: FloatArray, ring: int | None, path: str) -> tuple[int, float]:
     if ring is not None and not 0 <= ring < len(elevations):
         raise InputError(
-            f"data.ring must be 0 to {len(elevations) - 1}, not {ring} (of rcnn-odom run: --ring); left "
-            "out, it is the most level one"
+            f"data.ring must be 0 to {len(elevations) - 1}, not {ring} (with rcnn-odom run: --ring); leave "
+            "it out for the most level one"
         )
     chosen = int(np.argmin(np.abs(elevations - LEVEL))) if ring is None else ring
     elevation = float(elevations[chosen])
     if ring is None and abs(elevation - LEVEL) > NEAR_LEVEL:
         raise InputError(
             f"{path}: the most level of its {len(elevations)} rings lies at {np.rad2deg(elevation):+.1f} "
-            f"degrees, too far from level to see walls all round; if it is right, set data.ring={chosen} (of "
-            f"rcnn-odom run: --ring {chosen})"
+            f"degrees, too far from level to see walls all round; if it is right, set data.ring={chosen} "
+            f"(with rcnn-odom run: --ring {chosen})"
         )
     return chosen, elevation
 
 
 def _ring_elevations(clouds: list[list[Points]]) -> FloatArray:
-    """Median elevation in radians of every ring over frames, each given as its rings."""
+    """Median elevation (R,) in radians of each ring over the frames; a frame is a list of its rings."""
     elevations = [[median_elevation(ring) for ring in rings] for rings in clouds]
-    usual = int(np.median([len(of_frame) for of_frame in elevations]))
-    # In single frames a neighbour can be nearer to horizontal: the median over frames settles on one.
-    return np.nanmedian([of_frame[:usual] for of_frame in elevations if len(of_frame) >= usual], axis=0)
+    usual = int(np.median([len(frame) for frame in elevations]))
+    # The median over frames, because in single frames a neighbouring ring can be nearer to horizontal.
+    return np.nanmedian([frame[:usual] for frame in elevations if len(frame) >= usual], axis=0)
 
 
 @dataclass(frozen=True)
 class BeamReader:
-    """Frame index -> the returns of one beam, their ranges horizontal.
+    """Reads the returns of one beam, with horizontal ranges, by the index of a frame.
 
-    A frame in which an earlier ring was split or lost has its rings elsewhere in the file: where the
-    ring's elevation (radians) is far from the sequence's, the neighbour that has it is taken. A frame whose
-    points do not come laser by laser gives those at the beam.
+    If an earlier ring of a frame was split or lost, the ring has another number in it: then the elevation of
+    the ring is far from the usual one, and a neighbouring ring with that elevation is taken. In a frame whose
+    points are not laser by laser, the points at the elevation of the beam are taken.
 
     Attributes:
-        paths: of the frames.
-        stamps: seconds of each.
-        beam: where the points of the laser lie.
-        ring: number of the laser in the file; None where no frame's points come laser by laser.
-        elevation: median of the ring's, seen from the origin of the lowered points.
-        rise: metres by which the points are lowered to tell rings, see ``laser_frame.find_rise``.
+        paths: files of the frames.
+        stamps: seconds of each frame.
+        beam: elevation and height of the beam.
+        ring: number of the laser in the file; None if the points of no frame are laser by laser.
+        elevation: radians, usual elevation of the ring, seen from the origin of the lowered points.
+        rise: metres by which the points are lowered before use, see ``laser_frame.find_rise``.
         turns: seconds that the turn of each frame took; None: ``TURN``.
     """
 
@@ -308,23 +314,23 @@ class BeamReader:
     turns: tuple[float, ...] | None = None
 
     def __call__(self, frame: int) -> Scan:
-        """Reads one frame.
+        """Read one frame.
 
         Raises:
-            InputError: the frame cannot be read or has no such ring. (A blank one has no returns.)
+            InputError: the frame cannot be read or has no such ring. (A blank frame gives no returns.)
         """
         scan = Scan.from_points(self._read_points(frame), self.stamps[frame])
         assert scan.bearings is not None
         turn = TURN if self.turns is None else self.turns[frame]
-        return replace(scan, times=TURNS * turn / (2 * np.pi) * scan.bearings)
+        return replace(scan, times=TURN_DIRECTION * turn / (2 * np.pi) * scan.bearings)
 
     def _read_points(self, frame: int) -> Points:
         path = self.paths[frame]
-        points = lowered(read_points(path), self.rise)
+        points = lower_points(read_points(path), self.rise)
         rings = None if self.ring is None else split_rings(points)
         if self.ring is None or rings is None:
             return self._find_points(points, path, "its points do not come laser by laser, and none")
-        # In a nearly blank frame of many lasers nobody can count to one of them.
+        # In a nearly blank frame, most rings are missing, so the number of a ring has no meaning.
         if self.ring >= len(rings) or (self.ring and len(points) < FEWEST_POINTS):
             has = f"frame {frame} has {len(rings)} rings, so no ring {self.ring} (they count from 0)"
             return self._find_points(points, path, f"{has}, and no point")

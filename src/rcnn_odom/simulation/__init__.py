@@ -1,1 +1,1 @@
-"""Generated worlds, drives through them, and the lasers that look at them."""
+"""Generated worlds, drives through them, and simulated lasers."""

@@ -1,4 +1,4 @@
-"""Where the beams of a laser point that spaces them evenly, and when each leaves it."""
+"""Directions and times of the beams of a laser that spaces them evenly."""
 
 from dataclasses import dataclass
 
@@ -7,23 +7,27 @@ import numpy as np
 from rcnn_odom.geometry import FloatArray
 
 _ROUNDING = 1e-9
-"""Of a spacing: a field of view of 180 degrees has its last beam at 180, whatever 180 / spacing rounds to."""
+"""Tolerance in spacings, so that 180 degrees have a last beam at 180 however 180 / spacing is rounded."""
 
 
 @dataclass(frozen=True)
 class EvenBeams:
-    """Beams at equal angles over a part of the circle; options of :class:`~.kinds.LaserOptions`.
+    """Beams at equal angles over a part of the circle; see also :class:`~.kinds.LaserOptions`.
 
-    A whole circle has no beam twice. Where the circle is no multiple of the spacing, its last gap is smaller.
+    In a whole circle, the first beam is not repeated at 360 degrees; if the circle is not a multiple of the
+    spacing, the last gap is smaller.
 
     Attributes:
-        spacing_deg: from beam to beam.
-        field_of_view_deg: the part of the circle that they cover.
-        facing_deg: where its middle points, counter-clockwise from straight ahead.
-        phase_deg: from the edge of the field of view to the first beam.
-        interlaced: every second scan, from frame 1 on, has its beams half a spacing further on, and one fewer
-            where that leaves the field of view; SICK's LMS scan so in their finer modes.
-        clockwise: the beams come in falling order of their bearings.
+        spacing_deg: angle from beam to beam.
+        field_of_view_deg: angle that the beams cover.
+        facing_deg: direction of the middle of the field of view, counter-clockwise from straight ahead.
+        phase_deg: angle from the edge of the field of view to the first beam.
+        interlaced: whether the beams of every second scan, from frame 1 on, are shifted by half a spacing; a
+            beam that then leaves the field of view is dropped. SICK's LMS have this in their finer modes.
+        clockwise: whether the bearings of the beams decrease.
+
+    >>> np.rad2deg(EvenBeams(spacing_deg=45.0, field_of_view_deg=90.0).bearings(0)).tolist()
+    [-45.0, 0.0, 45.0]
     """
 
     spacing_deg: float
@@ -34,16 +38,16 @@ class EvenBeams:
     clockwise: bool = False
 
     def bearings(self, frame: int) -> FloatArray:
-        """Radians (B,) of the beams in their order, 0 ahead and counter-clockwise, not wrapped."""
-        turned = self._turned(frame)
-        return np.deg2rad(self.facing_deg + (-turned if self.clockwise else turned))
+        """Bearings (B,) of the beams in order, in radians, 0 ahead and counter-clockwise, not wrapped."""
+        offsets = self._offsets_deg(frame)
+        return np.deg2rad(self.facing_deg + (-offsets if self.clockwise else offsets))
 
     def times(self, frame: int, rate_hz: float) -> FloatArray:
-        """Seconds (B,) from the laser's passing the edge of its field of view to each of its beams."""
-        return (self._turned(frame) + self.field_of_view_deg / 2) / (360 * rate_hz)
+        """Seconds (B,) from the start of the field of view to each beam, at ``rate_hz`` turns per second."""
+        return (self._offsets_deg(frame) + self.field_of_view_deg / 2) / (360 * rate_hz)
 
-    def _turned(self, frame: int) -> FloatArray:
-        """Degrees (B,) by which each beam comes after the middle of the field of view."""
+    def _offsets_deg(self, frame: int) -> FloatArray:
+        """Degrees (B,) from the middle of the field of view to each beam, in the direction of turning."""
         view, spacing = self.field_of_view_deg, self.spacing_deg
         first = self.phase_deg + (spacing / 2 if self.interlaced and frame % 2 else 0)
         if view < 360:

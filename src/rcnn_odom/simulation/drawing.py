@@ -1,4 +1,4 @@
-"""What a building is drawn with: rooms, doors, lines and furniture, and the walls that they become."""
+"""Plan of a building with rooms, doors, lines and furniture, and its conversion to walls for ray casting."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -11,6 +11,7 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Material, Walls, join
 
 HEIGHTS = (-1.0, 3.0)
+"""Metres, bottom and top of all walls relative to the laser's plane."""
 PLASTER = Material(1.0, 0.003)
 WOOD = Material(0.995, 0.005)
 GLASS = Material(0.6, 0.01)
@@ -20,7 +21,12 @@ Leaf = Literal["open", "closed", "none"]
 
 @dataclass(frozen=True)
 class Room:
-    """A rectangle between walls, a hall too: its lower left and upper right corner in metres."""
+    """A room or hall: a rectangle between walls.
+
+    Attributes:
+        low: (x, y) of the lower left corner in metres.
+        high: (x, y) of the upper right corner in metres.
+    """
 
     low: tuple[float, float]
     high: tuple[float, float]
@@ -33,15 +39,15 @@ class Room:
 
 @dataclass(frozen=True)
 class Door:
-    """An opening through a wall.
+    """A door: an opening in a wall. Coordinates are in metres.
 
     Attributes:
-        axis: 0 when one walks through it along x, 1 along y.
-        faces: where on that axis the wall begins and ends, that of the room the leaf opens into last.
-        middle: of the opening, on the other axis.
-        width: metres.
-        wall: where the wall begins and ends, on the other axis.
-        leaf: what can be seen of the door itself.
+        axis: direction of walking through the door: 0 along x, 1 along y.
+        faces: the two faces of the wall on that axis, last the one of the room into which the leaf opens.
+        middle: middle of the opening, on the other axis.
+        width: width of the opening.
+        wall: coordinates of the ends of the wall, on the other axis.
+        leaf: state of the door leaf: ``open``, ``closed``, or ``none`` for an opening without a leaf.
     """
 
     axis: int
@@ -53,31 +59,40 @@ class Door:
 
     @property
     def place(self) -> tuple[float, float]:
-        """The middle of the opening."""
+        """(x, y) of the middle of the opening in metres."""
         through = sum(self.faces) / 2
         return (through, self.middle) if self.axis == 0 else (self.middle, through)
 
 
 @dataclass
 class Drawing:
-    """The building as far as it is drawn: lines (x, y, x, y) of every material, and free-standing things."""
+    """The plan of a building while it is drawn. Coordinates are in metres.
+
+    Attributes:
+        lines: (x, y, x, y) of the walls of each material.
+        doors: all doors.
+        boxes: furniture as rectangles: x, y, half length, half width, and direction in radians.
+        legs: thin things in the same form, which are drawn as crosses of two lines.
+    """
 
     lines: dict[Material, list[tuple[float, ...]]]
     doors: list[Door]
     boxes: list[tuple[float, float, float, float, float]]
-    """x, y, half the length, half the width and direction of furniture."""
     legs: list[tuple[float, float, float, float, float]]
-    """The same of thin things: a cross of two lines each."""
 
 
 def as_walls(drawing: Drawing) -> Walls:
-    """All that was drawn, without the furniture that would stand in a doorway."""
+    """Convert a plan to walls, without the furniture that would stand in a doorway."""
     boxes = _keep_doorways_free(np.array(drawing.boxes).reshape(-1, 5), drawing.doors)
     legs = _keep_doorways_free(np.array(drawing.legs).reshape(-1, 5), drawing.doors)
-    walls = [upright(np.array(lines).reshape(-1, 4), material) for material, lines in drawing.lines.items()]
+    walls = [
+        upright_walls(np.array(lines).reshape(-1, 4), material) for material, lines in drawing.lines.items()
+    ]
     square = np.array([[-1, -1, 1, -1], [1, -1, 1, 1], [1, 1, -1, 1], [-1, 1, -1, -1]])
     cross = np.array([[-1, -1, 1, 1], [-1, 1, 1, -1]])
-    return join([*walls, upright(_shapes(boxes, square), WOOD), upright(_shapes(legs, cross), WOOD)])
+    return join(
+        [*walls, upright_walls(_shapes(boxes, square), WOOD), upright_walls(_shapes(legs, cross), WOOD)]
+    )
 
 
 def _keep_doorways_free(things: FloatArray, doors: Sequence[Door]) -> FloatArray:
@@ -88,7 +103,15 @@ def _keep_doorways_free(things: FloatArray, doors: Sequence[Door]) -> FloatArray
 
 
 def _shapes(things: FloatArray, corners: npt.NDArray) -> FloatArray:
-    """Lines (L * K, 4) of a shape of ``corners`` (L, 4), unit size, for each of ``things`` (K, 5)."""
+    """Draw a shape for each of some things.
+
+    Args:
+        things: (K, 5) x, y, half length, half width and direction.
+        corners: (L, 4) lines of the shape, from -1 to 1.
+
+    Returns:
+        Lines (L * K, 4).
+    """
     x, y, half_length, half_width, direction = (column[:, None] for column in things.T)
     ends = []
     for end in (0, 2):
@@ -100,8 +123,8 @@ def _shapes(things: FloatArray, corners: npt.NDArray) -> FloatArray:
     return np.stack(ends, axis=-1).reshape(-1, 4)
 
 
-def upright(ends: FloatArray, material: Material) -> Walls:
-    """Walls of one material over lines (S, 4) on the floor, as high as the laser looks."""
+def upright_walls(ends: FloatArray, material: Material) -> Walls:
+    """Make walls of one material from lines (S, 4) on the floor; they reach above and below the laser."""
     count = len(ends)
     return Walls(
         ends.astype(np.float64),

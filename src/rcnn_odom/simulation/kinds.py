@@ -1,13 +1,14 @@
-"""Kinds of lasers by name: what their makers say of them, and what a user sets otherwise.
+"""Kinds of lasers by name, with values from their data sheets, and options to change them.
 
-The figures are those of the data sheets. SICK LMS 200: 180 degrees, 0.25 to 1 degree, a mirror of 75 turns a
-second, statistical error 5 mm, at most 80 m. Hokuyo UTM-30LX: 1,081 beams over 270 degrees, 25 ms a scan,
-counter-clockwise, repeatability below 10 mm up to 10 m and below 30 mm up to 30 m, which is drawn here as a
-straight line. Slamtec RPLidar A2 (A2M6 and A2M8): 4,000 samples a second, so 0.9 degrees at the usual ten
-turns a second (0.45 in the mode of 8,000), 5 to 15 turns, clockwise, 12 m, and a resolution of 1 % of the
-range, which is taken for the deviation here. Velodyne HDL-64E: as it was fitted to real frames, see
-:class:`rcnn_odom.simulation.laser.Laser`. How far off a wall that is hit squarely always answers is in none
-of them: twice the longest range of the small lasers, and as far as an HDL-64's for the others.
+SICK LMS 200: 180 degrees, 0.25 to 1 degree, a mirror with 75 turns per second, statistical error 5 mm, at
+most 80 m. Hokuyo UTM-30LX: 1,081 beams over 270 degrees, 25 ms a scan, counter-clockwise, repeatability below
+10 mm up to 10 m and below 30 mm up to 30 m; beyond 10 m it is modelled as proportional to the range. Slamtec
+RPLidar A2 (A2M6 and A2M8): 4,000 samples per second, so 0.9 degrees at the usual ten turns per second (0.45
+in the mode with 8,000), 5 to 15 turns, clockwise, 12 m, and a resolution of 1 % of the range, which is used
+as the standard deviation. Velodyne HDL-64E: fitted to real frames, see
+:class:`rcnn_odom.simulation.laser.Laser`.
+No data sheet gives the range up to which a wall hit at a right angle always returns the beam (``reach``). It
+is set to twice the longest range for the small lasers, and to the value of the HDL-64 for the others.
 """
 
 from dataclasses import dataclass, replace
@@ -21,12 +22,12 @@ from rcnn_odom.simulation.laser import Laser, hdl64_ring
 
 @dataclass(frozen=True)
 class Kind:
-    """A laser with evenly spaced beams.
+    """A kind of laser with evenly spaced beams.
 
     Attributes:
-        beams: where they point.
-        laser: how they measure.
-        rate_hz: turns a second; None: one in the time between two scans.
+        beams: directions of the beams.
+        laser: measurement model.
+        rate_hz: turns per second; None: one turn in the time between two scans.
     """
 
     beams: EvenBeams
@@ -34,34 +35,35 @@ class Kind:
     rate_hz: float | None = None
 
 
-def _level(max_range: float, noise: float, reach: float, noise_share: float | None = None) -> Laser:
+def _level_laser(max_range: float, noise: float, reach: float, noise_share: float | None = None) -> Laser:
     return Laser(0.0, max_range=max_range, noise=noise, reach=reach, noise_share=noise_share)
 
 
 KINDS = {
-    "sick": Kind(EvenBeams(1.0, 180.0), _level(80.0, 0.005, 110.0), 75.0),
-    "hokuyo": Kind(EvenBeams(0.25, 270.0), _level(30.0, 0.01, 60.0, 0.001), 40.0),
-    "rplidar": Kind(EvenBeams(0.9, 360.0, clockwise=True), _level(12.0, 0.005, 24.0, 0.01), 10.0),
-    "regular": Kind(EvenBeams(0.5, 360.0), _level(80.0, 0.01, 110.0)),
+    "sick": Kind(EvenBeams(1.0, 180.0), _level_laser(80.0, 0.005, 110.0), 75.0),
+    "hokuyo": Kind(EvenBeams(0.25, 270.0), _level_laser(30.0, 0.01, 60.0, 0.001), 40.0),
+    "rplidar": Kind(EvenBeams(0.9, 360.0, clockwise=True), _level_laser(12.0, 0.005, 24.0, 0.01), 10.0),
+    "regular": Kind(EvenBeams(0.5, 360.0), _level_laser(80.0, 0.01, 110.0)),
 }
 HDL64 = "hdl64"
 RING_RANGE = 80.0
+"""Metres, default maximum range of the HDL-64."""
 
 
 @dataclass(kw_only=True)
 class LaserOptions:
-    """``data.laser``; what is null is as the kind has it.
+    """Options of ``data.laser``; an option that is null has the value of the kind.
 
     Attributes:
-        kind: ``hdl64`` or one of ``KINDS``; null: the laser that the world has had from the start.
+        kind: ``hdl64`` or one of ``KINDS``; null: the default laser of the world.
         spacing_deg: degrees from beam to beam.
         phase_deg: degrees from the edge of the field of view to the first beam, less than ``spacing_deg``.
-        field_of_view_deg, facing_deg: the part of the circle, and where its middle points.
-        interlaced: the beams of every second scan lie in the middle between those of the others.
-        clockwise: order of the beams.
+        field_of_view_deg, facing_deg: degrees that the beams cover, and direction of their middle.
+        interlaced: whether the beams of every second scan lie half a spacing beside those of the others.
+        clockwise: whether the bearings of the beams decrease.
         noise: metres, standard deviation at any range.
         max_range: metres.
-        rate_hz: turns a second, for ``data.realism.skew``.
+        rate_hz: turns per second, for ``data.realism.skew``.
     """
 
     kind: str | None = option(default=None, choices=(HDL64, *KINDS))
@@ -89,17 +91,21 @@ class LaserOptions:
 
 
 def choose_laser(given: dict[str, Any]) -> tuple[Laser, EvenBeams | None, float | None] | None:
-    """The laser that options describe.
+    """Make the laser that options describe.
 
     Args:
         given: ``data.laser``: see :class:`LaserOptions`. Options may be missing.
 
     Returns:
-        The laser; its beams, None for an HDL-64, which shoots as it likes; and its turns a second, None where
-        it turns once in the time between two scans. None for all three where there is no kind.
+        The laser; its beams, None for an HDL-64, whose beams are irregular; and its turns per second, None if
+        it turns once in the time between two scans. None instead of all three if there is no kind.
 
     Raises:
-        InputError: an option is unknown or out of its bounds, does not fit the others, or has no kind.
+        InputError: an option is unknown, out of bounds, does not fit the others, or is given without a kind.
+
+    >>> laser, beams, rate = choose_laser({"kind": "sick", "spacing_deg": 0.5})
+    >>> laser.max_range, beams.spacing_deg, rate
+    (80.0, 0.5, 75.0)
     """
     check_options(LaserOptions, values := dict(given), "data.laser.")
     kind = values.pop("kind")
@@ -107,7 +113,7 @@ def choose_laser(given: dict[str, Any]) -> tuple[Laser, EvenBeams | None, float 
     if kind is None:
         if chosen:
             raise InputError(
-                f"data.laser.{next(iter(chosen))}: is of a laser with a kind; add data.laser.kind=regular"
+                f"data.laser.{next(iter(chosen))}: needs a kind of laser; add data.laser.kind=regular"
             )
         return None
     rate = chosen.pop("rate_hz", None)
@@ -127,10 +133,15 @@ def choose_laser(given: dict[str, Any]) -> tuple[Laser, EvenBeams | None, float 
 
 
 def _ring(chosen: dict[str, Any]) -> Laser:
+    """The HDL-64's ring with the chosen options.
+
+    Raises:
+        InputError: an option does not exist for an HDL-64.
+    """
     for name in ("phase_deg", "interlaced", "clockwise"):
         if name in chosen:
             raise InputError(
-                f"data.laser.{name}: an HDL-64 shoots whenever it is ready and turns clockwise; "
+                f"data.laser.{name}: an HDL-64 has irregular beams and turns clockwise; "
                 "leave it out, or set data.laser.kind=regular"
             )
     ring = hdl64_ring(chosen.pop("max_range", RING_RANGE))

@@ -1,4 +1,4 @@
-"""Lasers that look at a scene: one ring of an HDL-64 on a car, or a robot's level scanner."""
+"""Measurement model of lasers: one ring of an HDL-64 on a car, or a robot's level scanner."""
 
 from dataclasses import dataclass
 
@@ -14,25 +14,26 @@ GROUND = Material(returned=0.9, roughness=0.03)
 
 @dataclass(frozen=True)
 class Laser:
-    """A 2D laser.
+    """A 2D laser. One measurement of a beam is called a shot.
 
     Attributes:
-        step_deg: azimuth from one shot to the next.
-        half_steps: share of shots that follow after half of that; an HDL-64's encoder gives such.
-        field_of_view_deg: the part of the circle that it sees.
+        step_deg: change of azimuth from one shot to the next.
+        half_steps: part of the shots that follow after half of ``step_deg``, as an HDL-64's encoder causes.
+        field_of_view_deg: angle that the laser covers.
         max_range: metres.
-        rise: metres of the beams' common origin above the laser's.
-        elevation_deg: of all beams. Both were fitted to the HDL-64's eighth ring in KITTI, in frames 0 to
-            5 of sequence 00 and 0 to 19 of 90: its returns lie on z = 0.206 m - 0.452 degrees times range
-            to a millimetre, which is why the elevation of a return, seen from the laser's origin,
-            changes with its range.
-        noise: standard deviation of a range in metres.
-        reach: metres to which a wall that is hit squarely always answers; further off, and at a slant,
-            its chance falls with the power that comes back.
-        lost: chance that a shot is lost for no reason of the scene's.
+        rise: metres, height of the beams' common origin above the origin of the laser's frame.
+        elevation_deg: elevation of all beams. ``rise`` and ``elevation_deg`` were fitted to the HDL-64's
+            eighth ring in KITTI, in frames 0 to 5 of sequence 00 and 0 to 19 of 90: its returns lie on
+            z = 0.206 m - 0.452 degrees times range, to a millimetre. So the elevation of a return seen from
+            the origin changes with its range.
+        noise: metres, standard deviation of a range.
+        reach: metres up to which a wall that is hit at a right angle always gives a return. For farther or
+            slanted walls, the probability falls with the power that is reflected.
+        lost: probability that a shot is lost independently of the scene.
         trembling_deg: standard deviation of a shot's azimuth.
-        noise_share: ``noise`` grows to this share of the range where that is more; None: it does not.
-        facing_deg: where the middle of the field of view points, which is then cut out of a whole ring; None:
+        noise_share: the standard deviation of a range is at least this part of the range; None: no such
+            bound.
+        facing_deg: direction of the middle of the field of view, which is cut out of a whole ring; None:
             evenly spaced shots, symmetric about straight ahead.
     """
 
@@ -52,17 +53,17 @@ class Laser:
     def look(
         self, scene: Scene, frame: int, pose: FloatArray, rng: np.random.Generator, missing: bool = True
     ) -> npt.NDArray[np.float32]:
-        """One revolution, all of it at once.
+        """Simulate one revolution in which all shots happen at the same time.
 
         Args:
-            scene: what there is to see.
-            frame: when; moving things are where they are then.
+            scene: the scene.
+            frame: number of the frame, which gives the positions of moving objects.
             pose: (4, 4) laser to world.
-            rng: gives noise, and decides which shots are lost.
-            missing: False: everything within range answers.
+            rng: source of the noise and of lost shots.
+            missing: whether shots can be lost; False: everything within range gives a return.
 
         Returns:
-            The points of the shots that came back, as of :meth:`points`, by azimuth in [0, 2 pi).
+            The points of the returns as from :meth:`points`, sorted by azimuth in [0, 2 pi).
         """
         azimuth = self.azimuths(rng)
         return self.points(azimuth, self.shoot(scene, frame, pose, azimuth, rng, missing))
@@ -76,12 +77,15 @@ class Laser:
         rng: np.random.Generator,
         missing: bool = True,
     ) -> FloatArray:
-        """Ranges (B,) of shots in metres in the laser's plane, inf where none came back.
+        """Simulate the ranges of shots.
 
         Args:
-            scene, frame, rng, missing: as of :meth:`look`.
+            scene, frame, rng, missing: as for :meth:`look`.
             pose: (4, 4) laser to world, or (B, 4, 4) one for each shot.
-            azimuth: (B,) radians of the shots, in any order.
+            azimuth: (B,) radians, azimuths of the shots in any order.
+
+        Returns:
+            Ranges (B,) in metres in the laser's plane; inf for no return.
         """
         start, own = self._beams(azimuth)
         walls, turn = scene.walls(frame), pose[..., :3, :3]
@@ -91,7 +95,7 @@ class Laser:
         else:
             directions, origins = np.einsum("bij,bj->bi", turn, own), turn @ start + pose[:, :3, 3]
             depth, hit, squareness = cast_each(walls, scene.ground, origins, directions, self.max_range)
-        # HIT_GROUND and NO_WALL are the last but one and the last.
+        # HIT_GROUND (-2) and NO_WALL (-1) index the two values that are appended.
         roughness = np.append(walls.roughness, [GROUND.roughness, 0.0])[hit]
         ranges = depth / np.hypot(directions[:, 0], directions[:, 1])
         ranges += np.hypot(self._noise_at(ranges), roughness) * rng.standard_normal(len(ranges))
@@ -104,14 +108,17 @@ class Laser:
         return np.where(met, ranges, np.inf)
 
     def points(self, azimuth: FloatArray, ranges: FloatArray) -> npt.NDArray[np.float32]:
-        """The shots that came back as points.
+        """Convert the shots with a return to points.
 
         Args:
             azimuth: (B,) radians.
-            ranges: (B,) metres, as of :meth:`shoot`.
+            ranges: (B,) metres, as from :meth:`shoot`.
 
         Returns:
-            (P, 4) x, y, z in metres in the laser's frame and reflectance 0, as an HDL-64 file has them.
+            (P, 4) x, y, z in metres in the laser's frame and reflectance 0, as in a file of an HDL-64.
+
+        >>> hdl64_ring(max_range=80.0).points(np.zeros(2), np.array([10.0, np.inf])).shape
+        (1, 4)
         """
         start, own = self._beams(azimuth)
         met = np.isfinite(ranges)
@@ -120,17 +127,21 @@ class Laser:
         return points
 
     def _beams(self, azimuth: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """In the laser's frame: where all beams begin, (3,), and where they go, (B, 3), a metre away."""
+        """Common origin (3,) of the beams and their directions (B, 3), of horizontal length 1."""
         rise = np.full_like(azimuth, np.tan(np.deg2rad(self.elevation_deg)))
         return np.array([0.0, 0.0, self.rise]), np.stack([np.cos(azimuth), np.sin(azimuth), rise], axis=1)
 
     def _noise_at(self, ranges: FloatArray) -> FloatArray | float:
+        """Standard deviation in metres of ranges (B,)."""
         if self.noise_share is None:
             return self.noise
         return np.maximum(self.noise, self.noise_share * np.minimum(ranges, self.max_range))
 
     def azimuths(self, rng: np.random.Generator) -> FloatArray:
-        """Radians of every shot, rising from 0 to 2 pi: where they drop, a Velodyne's next ring begins."""
+        """Azimuths (B,) of the shots of a revolution in radians, sorted in [0, 2 pi).
+
+        They are sorted because the next ring of a Velodyne's file begins where the azimuth falls.
+        """
         step, view = self.step_deg, self.field_of_view_deg
         if view < 360 and self.facing_deg is None:
             shots = round(view / step) + 1
@@ -149,7 +160,7 @@ class Laser:
 
 
 def hdl64_ring(max_range: float) -> Laser:
-    """The ring of an HDL-64 that KITTI's loader takes; calibrated on real frames."""
+    """The ring of an HDL-64 that the KITTI reader chooses; its values were fitted to real frames."""
     return Laser(
         step_deg=0.18,
         half_steps=0.14,
@@ -161,5 +172,5 @@ def hdl64_ring(max_range: float) -> Laser:
 
 
 def scanner(resolution_deg: float, field_of_view_deg: float, max_range: float) -> Laser:
-    """A robot's level laser, such as a SICK LMS: degrees between its beams and in all, and metres."""
+    """A robot's level laser, such as a SICK LMS: degrees from beam to beam and covered, and metres."""
     return Laser(resolution_deg, field_of_view_deg=field_of_view_deg, max_range=max_range, noise=0.01)

@@ -1,4 +1,4 @@
-"""Where the beams of a laser end: a depth buffer over upright walls, then a march over the ground."""
+"""Casts the beams of a laser: a depth buffer over upright walls, then ray marching over the ground."""
 
 from functools import partial
 
@@ -14,31 +14,32 @@ from rcnn_odom.simulation.terrain import Ground, height_at
 NO_WALL = -1
 HIT_GROUND = -2
 _MARCH = 2.0
-"""Metres between two looks at the ground along a beam."""
+"""Metres, step of the ray marching over the ground."""
 _CELLS = 4096
-"""Of the table by which the beams of an azimuth are found."""
+"""Number of cells of the table that finds the beams at an azimuth."""
 
 
 def cast(
     walls: Walls, ground: Ground | None, origin: FloatArray, directions: FloatArray, max_range: float
 ) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
-    """The nearest thing that each beam meets.
+    """Find the nearest wall or ground that each beam hits.
 
     Args:
-        walls: S upright rectangles, in the world.
-        ground: also in the world; None: nowhere.
-        origin: (3,) metres, where the beams start.
-        directions: (B, 3) of the beams in the world, none of them vertical.
-        max_range: metres in the horizontal plane.
+        walls: S upright rectangles, in world coordinates.
+        ground: ground in world coordinates; None: there is none.
+        origin: (3,) metres, common origin of the beams.
+        directions: (B, 3) directions of the beams in the world, none of them vertical.
+        max_range: metres, in the horizontal plane.
 
     Returns:
-        Horizontal depth (B,) in metres, inf where nothing is within ``max_range``; what was hit (B,): the
-        index of a wall, ``HIT_GROUND``, or ``NO_WALL``; and how squarely (B,), from 0 along a wall to 1.
+        Horizontal distance (B,) in metres, inf if nothing is within ``max_range``; hit (B,): the index of a
+        wall, ``HIT_GROUND`` or ``NO_WALL``; and squareness (B,): the sine of the horizontal angle between
+        beam and wall, from 0 along the wall to 1 at a right angle.
     """
     beams, order = _by_azimuth(directions)
     depth, hit = _nearest_walls(walls.ends, walls.heights, origin, beams, max_range)
     origins = np.tile(origin, (len(order), 1))
-    squareness = _after_walls(walls, ground, origins, beams, max_range, depth, hit)
+    squareness = _add_ground(walls, ground, origins, beams, max_range, depth, hit)
     back = np.argsort(order)
     return depth[back], hit[back], squareness[back]
 
@@ -46,29 +47,29 @@ def cast(
 def cast_each(
     walls: Walls, ground: Ground | None, origins: FloatArray, directions: FloatArray, max_range: float
 ) -> tuple[FloatArray, npt.NDArray[np.int64], FloatArray]:
-    """The same for beams that start each somewhere else, not far from each other, as of a laser on the move.
+    """The same as :func:`cast` for beams with different origins near each other, as of a moving laser.
 
     Args:
-        walls, ground, directions, max_range: as of :func:`cast`.
-        origins: (B, 3) metres, where the beams start.
+        walls, ground, directions, max_range: as for :func:`cast`.
+        origins: (B, 3) metres, origins of the beams.
     """
     beams, order = _by_azimuth(directions)
     origins = np.ascontiguousarray(origins[order])
-    depth, hit = _nearest_walls_of_each(walls.ends, walls.heights, origins, beams, max_range)
-    squareness = _after_walls(walls, ground, origins, beams, max_range, depth, hit)
+    depth, hit = _nearest_walls_each(walls.ends, walls.heights, origins, beams, max_range)
+    squareness = _add_ground(walls, ground, origins, beams, max_range, depth, hit)
     back = np.argsort(order)
     return depth[back], hit[back], squareness[back]
 
 
 def _by_azimuth(directions: FloatArray) -> tuple[FloatArray, npt.NDArray[np.int64]]:
-    """Beams (4, B) in the order of their azimuth, as rank, x, y and slope, and that order (B,)."""
+    """Sort beams by azimuth; returns their ranks, x, y and slopes (4, B), and the order (B,) of the beams."""
     rank = _azimuth_rank(directions[:, 0], directions[:, 1])
     order = np.argsort(rank)
     level = np.hypot(directions[:, 0], directions[:, 1])
     return np.stack([rank, *(directions / level[:, None]).T])[:, order], order
 
 
-def _after_walls(
+def _add_ground(
     walls: Walls,
     ground: Ground | None,
     origins: FloatArray,
@@ -77,7 +78,7 @@ def _after_walls(
     depth: FloatArray,
     hit: npt.NDArray[np.int64],
 ) -> FloatArray:
-    """How squarely each beam meets what it meets; ``depth`` and ``hit`` where ground is before the walls."""
+    """Compute the squareness (B,), and update ``depth`` and ``hit`` of beams that hit the ground first."""
     squareness = _squareness(walls.ends, hit, beams)
     if ground is not None:
         shape = ground.heights, ground.corner, ground.step, ground.steepest
@@ -87,7 +88,7 @@ def _after_walls(
 
 @partial(compiled, how=vectorize)
 def _azimuth_rank(x, y):  # type: ignore[no-untyped-def]
-    """Grows with the azimuth, from -2 to 2: all that sorting asks for, at a tenth of an arctangent's cost."""
+    """A number from -2 to 2 that grows with the azimuth, ten times faster to compute than the azimuth."""
     share = y / (abs(x) + abs(y))
     if x >= 0:
         return share
@@ -96,7 +97,7 @@ def _azimuth_rank(x, y):  # type: ignore[no-untyped-def]
 
 @compiled
 def _first_beam(ranks, table, rank):  # type: ignore[no-untyped-def]
-    """The first of the sorted beams that is not before a direction; the table saves the search."""
+    """The first of the sorted beams whose rank is not below ``rank``; the table shortens the search."""
     beam = table[int((rank + 2) * (_CELLS / 4))]
     while beam > 0 and ranks[beam - 1] >= rank:
         beam -= 1
@@ -120,17 +121,17 @@ def _nearest_walls(  # type: ignore[no-untyped-def]
         reach = 2 * max_range + abs(x2 - x1) + abs(y2 - y1)
         if across == 0 or (x1 + x2) ** 2 + (y1 + y2) ** 2 > reach**2:
             continue
-        if across < 0:  # seen from its other side: counter-clockwise is from the first end to the second
+        if across < 0:  # swap the ends, so that the second one is counter-clockwise from the first
             x1, y1, x2, y2, across = x2, y2, x1, y1, -across
         low, high = heights[wall, 0] - origin[2], heights[wall, 1] - origin[2]
         first = _first_beam(ranks, table, _azimuth_rank(x1, y1))
         stop = _first_beam(ranks, table, _azimuth_rank(x2, y2))
-        if y1 >= 0 > y2:  # the wall lies across the direction in which ranks start again
+        if y1 >= 0 > y2:  # the wall crosses the direction where the ranks jump from 2 to -2
             stop += len(ranks)
         for position in range(first, stop):
             beam = position % len(ranks)
             closing = east[beam] * (y2 - y1) - north[beam] * (x2 - x1)
-            if closing <= 0:  # along the wall: its neighbours at the end do the hiding
+            if closing <= 0:  # the beam is parallel to the wall and cannot hit it
                 continue
             distance = across / closing
             if distance < depth[beam] and low <= slope[beam] * distance <= high:
@@ -141,7 +142,7 @@ def _nearest_walls(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
+def _nearest_walls_each(  # type: ignore[no-untyped-def]
     ends, heights, origins, beams, max_range
 ):
     ranks, east, north, slope = beams
@@ -152,7 +153,7 @@ def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
     middle = origins.sum(axis=0) / len(origins)
     apart = np.sqrt((origins[:, 0] - middle[0]) ** 2 + (origins[:, 1] - middle[1]) ** 2).max()
     for wall in range(len(ends)):
-        first_rank, width = _seen_between(ends[wall], middle, apart, max_range)
+        first_rank, width = _rank_interval(ends[wall], middle, apart, max_range)
         first = np.searchsorted(ranks, first_rank)
         for later in range(len(ranks)):
             beam = (first + later) % len(ranks)
@@ -173,11 +174,12 @@ def _nearest_walls_of_each(  # type: ignore[no-untyped-def]
 
 
 @compiled
-def _seen_between(wall, middle, apart, max_range):  # type: ignore[no-untyped-def]
-    """The rank of the first beam that may meet a wall, and by how much the last one's is greater.
+def _rank_interval(wall, middle, apart, max_range):  # type: ignore[no-untyped-def]
+    """Rank of the first beam that may hit a wall, and difference to the rank of the last such beam.
 
-    No beam starts further than ``apart`` from the middle, so that what is ``near`` metres away is seen at
-    most the arcsine of their ratio beside where the middle sees it; ranks differ by less than angles do.
+    No beam starts farther than ``apart`` from the middle. So the azimuth of a point at distance ``near``
+    differs by at most arcsin(apart / near) from its azimuth seen from the middle. Differences of ranks are
+    smaller than those of angles.
     """
     x1, y1 = wall[0] - middle[0], wall[1] - middle[1]
     x2, y2 = wall[2] - middle[0], wall[3] - middle[1]
@@ -219,13 +221,13 @@ def _meet_ground(  # type: ignore[no-untyped-def]
         end = min(depth[beam], max_range)
         closing = max(steepest - slope[beam], 1e-3)
         while distance < end:
-            # So far there can be no ground, however it rises.
+            # The ground cannot reach the beam within this distance, even at its steepest.
             distance += _MARCH * max(1, int(above_before / (closing * _MARCH)))
             x, y = origin[0] + east[beam] * distance, origin[1] + north[beam] * distance
             above = origin[2] + slope[beam] * distance - height_at(heights, corner, step, x, y)
             if above < 0:
-                # The step was one _MARCH: a longer one cannot end below ground, since even the steepest
-                # would need all of it to rise to the beam.
+                # The step was one _MARCH long: a longer one cannot end below the ground, because even the
+                # steepest ground would need all of it to rise to the beam.
                 share = above_before / (above_before - above)
                 met = distance - (1 - share) * _MARCH
                 if met < end:

@@ -1,4 +1,4 @@
-"""What a laser can hit, in whatever world: upright rectangles, standing or moving, and the ground."""
+"""The scene that a laser measures: standing and moving upright rectangles, and the ground."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
@@ -12,11 +12,11 @@ from rcnn_odom.simulation.terrain import Ground
 
 @dataclass(frozen=True)
 class Material:
-    """How a laser sees a surface.
+    """Properties of a surface for a laser.
 
     Attributes:
-        returned: chance that a beam comes back.
-        roughness: standard deviation of the depth in metres, beyond the laser's own noise.
+        returned: probability that a beam is returned.
+        roughness: metres, standard deviation of the surface's depth, in addition to the laser's noise.
     """
 
     returned: float = 1.0
@@ -25,12 +25,12 @@ class Material:
 
 @dataclass(frozen=True)
 class Walls:
-    """Upright rectangles, S of them: a house is some, a tree trunk is five narrow ones.
+    """S upright rectangles; a tree trunk, for instance, is five narrow ones.
 
     Attributes:
         ends: (S, 4) metres: x and y of one end, x and y of the other.
-        heights: (S, 2) metres: bottom and top, in the world's z.
-        returned: (S,) chance that a beam comes back.
+        heights: (S, 2) metres: z of the bottom and of the top in the world.
+        returned: (S,) probability that a beam is returned.
         roughness: (S,) metres, standard deviation of the depth.
     """
 
@@ -47,7 +47,7 @@ class Walls:
 
 
 def join(walls: Sequence[Walls]) -> Walls:
-    """All of them as one."""
+    """Join several sets of walls to one."""
     return Walls(*(np.concatenate([getattr(w, column.name) for w in walls]) for column in fields(Walls)))
 
 
@@ -56,13 +56,13 @@ NO_WALLS = Walls(np.zeros((0, 4)), np.zeros((0, 2)), np.zeros(0), np.zeros(0))
 
 @dataclass(frozen=True)
 class Scene:
-    """All that a drive of N frames passes.
+    """All objects along a drive of N frames.
 
     Attributes:
-        standing: what does not move.
-        moving: where the walls of all that moves are, frame after frame.
-        moving_starts: (N + 1,) where in ``moving`` every frame begins.
-        ground: None where a laser looks level over a floor and never meets it.
+        standing: walls that do not move.
+        moving: walls of moving objects, those of one frame after those of the frame before.
+        moving_starts: (N + 1,) index in ``moving`` of the first wall of each frame, and number of all.
+        ground: the ground; None: the laser is level above a floor and never hits it.
     """
 
     standing: Walls
@@ -71,6 +71,6 @@ class Scene:
     ground: Ground | None = None
 
     def walls(self, frame: int) -> Walls:
-        """Those of one frame, the standing ones first."""
+        """The walls of a frame, the standing ones first."""
         start, stop = self.moving_starts[frame : frame + 2]
         return join([self.standing, self.moving[start:stop]]) if stop > start else self.standing

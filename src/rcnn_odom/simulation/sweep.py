@@ -1,4 +1,4 @@
-"""Where a laser is at each of its beams, when it moves while it turns."""
+"""Poses of a moving laser at the times of its beams."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -7,12 +7,20 @@ from rcnn_odom.geometry import FloatArray, wrap_angle
 
 
 def poses_at(poses: FloatArray, stamps: FloatArray, moments: FloatArray) -> FloatArray:
-    """Poses (B, 4, 4) at some moments: straight on and turning evenly from each frame to the next.
+    """Interpolate poses: linearly in position and at a constant turn rate between two frames.
 
     Args:
-        poses: (N, 4, 4) of two frames or more.
-        stamps: (N,) seconds, rising.
-        moments: (B,) seconds; before the first frame and after the last the nearest motion goes on.
+        poses: (N, 4, 4), N >= 2.
+        stamps: (N,) seconds, increasing.
+        moments: (B,) seconds; before the first and after the last frame, the nearest motion is extrapolated.
+
+    Returns:
+        Poses (B, 4, 4) at the moments.
+
+    >>> poses = np.stack([np.eye(4), np.eye(4)])
+    >>> poses[1, 0, 3] = 2.0
+    >>> float(poses_at(poses, np.array([0.0, 1.0]), np.array([0.25]))[0, 0, 3])
+    0.5
     """
     start = np.clip(np.searchsorted(stamps, moments, side="right") - 1, 0, len(stamps) - 2)
     share = (moments - stamps[start]) / (stamps[start + 1] - stamps[start])
@@ -26,9 +34,13 @@ def poses_at(poses: FloatArray, stamps: FloatArray, moments: FloatArray) -> Floa
 
 
 def ring_times(azimuth: FloatArray, rate_hz: float) -> FloatArray:
-    """Seconds of an HDL-64's shots (B,) after it looked straight ahead.
+    """Seconds (B,) of an HDL-64's shots after it pointed straight ahead.
 
-    It turns clockwise from behind to behind, as on KITTI's car, whose raw recordings are stamped when the
-    laser looks ahead.
+    Args:
+        azimuth: (B,) radians.
+        rate_hz: turns per second.
+
+    The laser turns clockwise, and a turn begins and ends behind the car. As in KITTI's raw recordings, the
+    stamp is the time when the laser points ahead.
     """
     return -wrap_angle(azimuth) / (2 * np.pi * rate_hz)

@@ -1,4 +1,4 @@
-"""Worlds and drives: what a name, a seed and some choices stand for, built when it is asked for."""
+"""Builds worlds and drives from a name, a seed and some options, when they are first used."""
 
 import zlib
 from dataclasses import dataclass, replace
@@ -13,40 +13,42 @@ from rcnn_odom.simulation.blind.drive import BlindDrive, blind_drive, kind_of
 from rcnn_odom.simulation.indoor.building import Building, plan_building
 from rcnn_odom.simulation.indoor.people import populate
 from rcnn_odom.simulation.indoor.robot import random_walk
-from rcnn_odom.simulation.plain_places import along, bare_corridor, few_posts
 from rcnn_odom.simulation.scene import NO_WALLS, Scene
+from rcnn_odom.simulation.sparse_places import bare_corridor, drive_straight, few_posts
 from rcnn_odom.simulation.street.city import Plan, Roads, Warp, random_plan, random_warp
 from rcnn_odom.simulation.street.drive import Drive, at_other_paces, random_drive
 from rcnn_odom.simulation.street.speed import FRAME_TIME
 from rcnn_odom.simulation.street.street import build_streets
 from rcnn_odom.simulation.street.traffic import build_traffic
-from rcnn_odom.simulation.terrain import Ground, flat_ground, random_ground, stand
+from rcnn_odom.simulation.terrain import Ground, flat_ground, place_on_ground, random_ground
 
 WORLDS = ("street", "indoor", "corridor", "few_returns", "standstill", "standstill_street", "blind")
 MINUTE_RATE = 10.0
-"""Scans a second of all drives but those of ``street`` and ``indoor``."""
+"""Default number of scans per second, except for ``street`` and ``indoor``."""
 
 STRETCH = 20
-"""Frames for which what is in range is picked out together."""
+"""Number of frames that share one selection of the walls in range."""
 
 LASER_HEIGHT = 1.73
+"""Metres, mean height of a car's laser above the ground."""
 MOUNTING_DEG, MOUNTING_HEIGHT = 0.2, 0.03
-"""Standard deviation of how the laser sits on this drive's car: pitch and roll, and metres."""
+"""Standard deviations of the laser's mounting on a car: pitch and roll in degrees, and height in metres."""
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """Everything that a world and the drive through it follow from.
+    """All options from which a world and the drive through it are built.
 
     Attributes:
         name, seed: choose the world.
         world: one of ``WORLDS``.
-        frames: scans of the drive.
-        movers: other cars and people move.
-        tilt: the car leans on its springs and the ground has slopes.
-        other_paces: a car drives faster and slower than KITTI's.
-        turn_rate_deg_s: of the robot that turns on the spot, indoors; None: its own.
-        scan_rate_hz: scans a second, but for streets; None: the robot's own.
+        frames: number of scans of the drive.
+        movers: whether other cars and people move.
+        tilt: whether the car pitches and rolls on its springs and the ground has slopes.
+        other_paces: whether a car drives faster and slower than KITTI's.
+        turn_rate_deg_s: degrees per second at which the robot indoors turns on the spot; None: a random rate.
+        scan_rate_hz: scans per second, not for streets; None: a random rate for ``indoor``, otherwise
+            ``MINUTE_RATE``.
     """
 
     name: str
@@ -60,7 +62,7 @@ class Recipe:
     scan_rate_hz: float | None = None
 
     def generator(self, *purpose: int) -> np.random.Generator:
-        """Independent random numbers for every seed, name and purpose."""
+        """A random generator that is independent for every seed, name and purpose."""
         return np.random.default_rng([self.seed, zlib.crc32(self.name.encode()), *purpose])
 
 
@@ -68,6 +70,8 @@ _PLAN, _DRIVE, _GROUND, _STANDING, _MOVING, SCAN = range(6)
 
 
 class _Street(NamedTuple):
+    """A city and a drive through it."""
+
     plan: Plan
     warp: Warp
     ground: Ground
@@ -89,16 +93,16 @@ def _street(recipe: Recipe) -> _Street:
     height = LASER_HEIGHT + rng.normal(0, MOUNTING_HEIGHT)
     if recipe.tilt:
         ground = random_ground(low, high, rng)
-        poses = stand(drive.planar, drive.tilt + mounting, height, ground)
+        poses = place_on_ground(drive.planar, drive.tilt + mounting, height, ground)
     else:
         ground = flat_ground(low, high)
-        poses = stand(drive.planar, np.zeros_like(drive.tilt), height, ground)
+        poses = place_on_ground(drive.planar, np.zeros_like(drive.tilt), height, ground)
     return _Street(plan, warp, ground, drive, poses)
 
 
 @lru_cache(maxsize=4)
 def _indoor(recipe: Recipe) -> tuple[Building, FloatArray, FloatArray]:
-    """A building, where in it the laser goes, (N, 3), and when, (N,)."""
+    """A building, the laser's x, y and heading (N, 3) in it, and the stamps (N,) in seconds."""
     building, rng = plan_building(recipe.generator(_PLAN)), recipe.generator(_DRIVE)
     if recipe.world == "standstill":
         place, _ = random_walk(building, 1, rng)
@@ -113,13 +117,13 @@ def _blind(recipe: Recipe) -> BlindDrive:
 
 
 def _parked(recipe: Recipe) -> _Street:
-    """Where a drive through the streets begins."""
+    """The street where a parked car stands: a drive of two frames, whose first pose is used."""
     return _street(replace(recipe, world="street", frames=2))
 
 
 @lru_cache(maxsize=4)
 def poses_of(recipe: Recipe) -> FloatArray:
-    """Laser to world, (N, 4, 4)."""
+    """Poses (N, 4, 4) of the laser in the world."""
     if recipe.world == "street":
         return _street(recipe).poses
     if recipe.world == "standstill_street":
@@ -128,11 +132,11 @@ def poses_of(recipe: Recipe) -> FloatArray:
         return planar_to_poses(_indoor(recipe)[1])
     if recipe.world == "blind":
         return _blind(recipe).poses
-    return planar_to_poses(along(_even_stamps(recipe)))
+    return planar_to_poses(drive_straight(_even_stamps(recipe)))
 
 
 def stamps_of(recipe: Recipe) -> FloatArray:
-    """Seconds, (N,): those of KITTI's laser, or of the robot's own."""
+    """Stamps (N,) of the scans in seconds."""
     if recipe.world in ("indoor", "standstill"):
         return _indoor(recipe)[2]
     if recipe.world == "street":
@@ -145,14 +149,20 @@ def _even_stamps(recipe: Recipe) -> FloatArray:
 
 
 def roads_of(recipe: Recipe) -> Roads:
-    """What kind of roads a street drive goes along."""
+    """The kind of roads of a drive on streets."""
     return _street(recipe).plan.roads
 
 
 @lru_cache(maxsize=2)
 def scene_near(recipe: Recipe, number: int, max_range: float) -> Scene:
-    """The scene without what is out of range on a stretch of the drive: most of a city always is."""
-    scene, (middles, longest) = _scene(recipe), _places(recipe)
+    """The scene with only the standing walls that are in range on a stretch of the drive.
+
+    Args:
+        recipe: the world and drive.
+        number: number of the stretch, of ``STRETCH`` frames.
+        max_range: metres.
+    """
+    scene, (middles, longest) = _scene(recipe), _index_walls(recipe)
     driven = poses_of(recipe)[number * STRETCH : (number + 1) * STRETCH, :2, 3]
     centre = driven.mean(0)
     reach = max_range + np.hypot(*(driven - centre).T).max() + longest / 2
@@ -161,8 +171,8 @@ def scene_near(recipe: Recipe, number: int, max_range: float) -> Scene:
 
 
 @lru_cache(maxsize=2)
-def _places(recipe: Recipe) -> tuple[cKDTree, float]:
-    """The middles of the standing walls, to be looked up by place, and the longest one's metres."""
+def _index_walls(recipe: Recipe) -> tuple[cKDTree, float]:
+    """A search tree of the middles of the standing walls, and the length of the longest wall in metres."""
     ends = _scene(recipe).standing.ends
     return cKDTree((ends[:, :2] + ends[:, 2:]) / 2), float(np.hypot(*(ends[:, 2:] - ends[:, :2]).T).max())
 
@@ -170,12 +180,12 @@ def _places(recipe: Recipe) -> tuple[cKDTree, float]:
 @lru_cache(maxsize=2)
 def _scene(recipe: Recipe) -> Scene:
     standing, moving = recipe.generator(_STANDING), recipe.generator(_MOVING)
-    still = np.zeros(recipe.frames + 1, dtype=np.int64)
+    no_movers = np.zeros(recipe.frames + 1, dtype=np.int64)
     if recipe.world in ("corridor", "few_returns"):
         build = bare_corridor if recipe.world == "corridor" else few_posts
-        return Scene(build(float(along(stamps_of(recipe))[-1, 0]), standing), NO_WALLS, still)
+        return Scene(build(float(drive_straight(stamps_of(recipe))[-1, 0]), standing), NO_WALLS, no_movers)
     if recipe.world == "blind":
-        return Scene(_blind(recipe).walls, NO_WALLS, still, _blind(recipe).ground)
+        return Scene(_blind(recipe).walls, NO_WALLS, no_movers, _blind(recipe).ground)
     if recipe.world in ("indoor", "standstill"):
         building, planar, _ = _indoor(recipe)
         return populate(building, planar, standing, recipe.movers, recipe.scan_rate_hz)
@@ -183,5 +193,5 @@ def _scene(recipe: Recipe) -> Scene:
     plan, warp, ground, drive, _ = street
     walls = build_streets(plan, warp, ground, drive.path, standing)
     if not recipe.movers or recipe.world == "standstill_street":
-        return Scene(walls, NO_WALLS, still, ground)
+        return Scene(walls, NO_WALLS, no_movers, ground)
     return Scene(walls, *build_traffic(plan, warp, ground, drive, moving), ground)

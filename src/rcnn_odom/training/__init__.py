@@ -1,1 +1,1 @@
-"""Experiments: the only package that knows Lightning and Hydra."""
+"""Training and evaluation runs: the only package that uses Lightning and Hydra."""

@@ -1,4 +1,4 @@
-"""Augmentation of training windows that leaves their true steps exact: other ways, other lasers, losses."""
+"""Augmentation of training windows: other poses, other lasers, lost returns. The true steps stay exact."""
 
 import math
 from collections.abc import Sequence
@@ -17,34 +17,35 @@ from rcnn_odom.simulation.laser import hdl64_ring
 
 DepthVectors = npt.NDArray[np.float32]
 
-MOVES = -1.5, 0.35
-"""Powers of ten between which a window's moves are multiplied: most are small, some twice the deviation."""
-LEAST_SEEN = 0.2
-"""Share of a scan's returns that must still be there after a move."""
-MOST_HALVINGS = 8
-"""Of a move that leaves too little; the next one is none."""
-FARTHEST_MOVE = 0.25
-"""Of the sensor's range, for the deviation of a move: farther off, two scans have nothing in common."""
-MOST_TURNED_DEG = 90.0
-"""Deviation of a move's heading at most."""
-FINEST_BEAMS = 0.5
-"""Bins between the beams of a pattern at least: closer ones would only be averaged."""
-FEWEST_BEAMS = 10
-"""Of a pattern, over the field of view."""
-SPACINGS = 12
-"""From the least to the largest: so few that where their beams point is not computed for every window."""
+MOVE_SCALE_POWERS = -1.5, 0.35
+"""Range of the power of ten that scales a window's moves: most are small, some twice the deviation."""
+MIN_VISIBLE_SHARE = 0.2
+"""Smallest share of a scan's returns that must remain after a move."""
+MAX_HALVINGS = 8
+"""Number of times that a move with too few remaining returns is halved; the last time it becomes zero."""
+MAX_MOVE_SHARE = 0.25
+"""Largest deviation of a move as a share of the sensor's range; scans farther apart hardly overlap."""
+MAX_MOVE_TURN_DEG = 90.0
+"""Largest deviation of the heading of a move."""
+MIN_SPACING_BINS = 0.5
+"""Smallest spacing of a beam pattern in bins; closer beams would only be averaged within a bin."""
+MIN_BEAMS = 10
+"""Smallest number of beams of a pattern over the field of view."""
+SPACING_COUNT = 12
+"""Number of spacings between the smallest and the largest; few, so that beam directions are cached."""
 VELODYNE = hdl64_ring(80.0)
 VELODYNE_SHARE = 0.2
-"""Windows that have its irregular pattern, where its spacing is among those that are asked for."""
+"""Share of the windows with a Velodyne's irregular pattern, if its spacing is within the limits."""
 
 
 class Beams(NamedTuple):
     """The beams of another laser.
 
     Attributes:
-        grid: with a beam in the middle of each bin.
-        phase: radians by which all of them are turned to the left.
-        is_irregular: only some are shot, as a Velodyne does: one in two, and now and then the next one.
+        grid: a sensor whose bins are centred on the beams.
+        phase: angle in radians by which all beams are turned to the left.
+        is_irregular: whether only some beams are fired, as by a Velodyne: mostly every second beam of the
+            grid, sometimes two neighbouring ones.
     """
 
     grid: Sensor
@@ -54,24 +55,33 @@ class Beams(NamedTuple):
 
 @dataclass(frozen=True)
 class Augmentation:
-    """What happens to the windows of a training: ``data.augment``. With the defaults nothing does.
+    """Changes training windows at random: ``data.augment``. The defaults change nothing.
 
-    Draws depend on the window's seed alone. Amounts are drawn for each window, from nothing up to what is
-    asked for.
+    The random numbers depend only on the window's seed. Each window draws its own amounts, between zero and
+    the given limits.
 
     Attributes:
-        sensor: of the scans.
-        mirror: every other window is mirrored; the sampler draws which.
-        max_turn_deg: the second scan of each pair is turned by up to so many degrees, whole bins, each pair
-            for itself.
-        move: deviations in metres ahead, metres to the left and degrees of the places from which the scans
-            after a window's first one are seen; None: from where they were taken.
-        max_range_scale: the scene is up to so many times larger or smaller.
-        lost_beams: share of the returns that are lost at random, at most.
-        lost_sector_deg: widest sector without returns, in all scans of a window the same.
-        noise: metres, the largest deviation of normal noise of the ranges.
-        beam_pattern: least and largest degrees between the beams of the lasers that all scans of a window are
-            seen with; None: as they are.
+        sensor: the sensor of the scans.
+        mirror: mirrors half of the windows; the sampler draws which.
+        max_turn_deg: largest turn in degrees of the second scan of a pair. Turns are whole bins and
+            independent from pair to pair.
+        move: standard deviations (metres ahead, metres to the left, degrees) of the virtual poses from which
+            all scans of a window but the first are seen; None: scans keep their poses.
+        max_range_scale: largest factor by which the scene is scaled up or down.
+        lost_beams: largest share of returns that are lost at random.
+        lost_sector_deg: width in degrees of the largest sector without returns; the same sector in all scans
+            of a window.
+        noise: largest standard deviation, in metres, of normal noise of the ranges.
+        beam_pattern: smallest and largest spacing, in degrees, of the beams of a virtual laser that sees all
+            scans of a window; None: scans keep their beams.
+
+    Raises:
+        InputError: an option does not fit the sensor.
+
+    >>> augmentation = Augmentation(Sensor(1.0, 180.0, 40.0), max_range_scale=2.0)
+    >>> scans, steps = augmentation.change(np.ones((2, 181)), np.array([[1.0, 0.0, 0.1]]), seed=0)
+    >>> bool(np.isclose(scans[0, 0], steps[0, 0])), float(steps[0, 2])
+    (True, 0.1)
     """
 
     sensor: Sensor
@@ -85,54 +95,57 @@ class Augmentation:
     beam_pattern: Sequence[float] | None = None
 
     def __post_init__(self) -> None:
-        view, farthest = self.sensor.field_of_view_deg, FARTHEST_MOVE * self.sensor.max_range
+        view, farthest = self.sensor.field_of_view_deg, MAX_MOVE_SHARE * self.sensor.max_range
         if self.mirror and self.sensor.facing_deg % 180:
             raise InputError(
                 f"data.augment.mirror=true: the mirror image of a laser that faces "
                 f"{self.sensor.facing_deg:g} degrees is another laser; leave it out"
             )
-        if self.move is not None and (max(self.move[:2]) > farthest or self.move[2] > MOST_TURNED_DEG):
+        if self.move is not None and (max(self.move[:2]) > farthest or self.move[2] > MAX_MOVE_TURN_DEG):
             raise InputError(
                 f"data.augment.move={list(self.move)}: two scans would have nothing in common; at most "
-                f"{farthest:g} m, a quarter of data.sensor.max_range, and {MOST_TURNED_DEG:g} degrees"
+                f"{farthest:g} m, a quarter of data.sensor.max_range, and {MAX_MOVE_TURN_DEG:g} degrees"
             )
         if self.lost_sector_deg >= view:
             raise InputError(
                 f"data.augment.lost_sector_deg={self.lost_sector_deg:g}: is all that the sensor sees; set "
                 f"less than {view:g}"
             )
-        finest, widest = FINEST_BEAMS * self.sensor.resolution_deg, view / FEWEST_BEAMS
+        finest, widest = MIN_SPACING_BINS * self.sensor.resolution_deg, view / MIN_BEAMS
         if self.beam_pattern is not None and not (
             finest <= self.beam_pattern[0] and self.beam_pattern[1] <= widest
         ):
             raise InputError(
                 f"data.augment.beam_pattern={list(self.beam_pattern)}: for this sensor from {finest:g} "
-                f"degrees, half a bin, to {widest:g}, {FEWEST_BEAMS} beams in its field of view"
+                f"degrees, half a bin, to {widest:g}, {MIN_BEAMS} beams in its field of view"
             )
 
     @property
     def max_turn_bins(self) -> int:
-        """Whole bins by which a second scan is turned at most."""
+        """Largest turn of a second scan in whole bins."""
         return round(self.max_turn_deg / self.sensor.resolution_deg)
 
     @property
-    def is_of_scans(self) -> bool:
-        """Whether :meth:`change` changes anything."""
+    def changes_scans(self) -> bool:
+        """Whether :meth:`change` has an effect."""
         options = self.move, self.beam_pattern, self.lost_beams, self.lost_sector_deg, self.noise
         return any(options) or self.max_range_scale != 1
 
     def change(self, scans: DepthVectors, steps: FloatArray, seed: int) -> tuple[DepthVectors, FloatArray]:
-        """A window's scans and steps with all but turns and mirror images; the given ones stay as they are.
+        """Applies all changes but turns and mirror images to a window.
 
-        In this order: the scene's scale, so that moves and noise are metres of what is seen; the places from
-        which it is seen, and the laser, in one; lost returns; noise.
+        The order is: the scale of the scene, so that moves and noise are metres in the scaled scene; the
+        virtual poses and the virtual laser, in one rendering; noise and lost returns.
 
         Args:
-            scans: (T + 1, bins) metres.
-            steps: (T, 3) metres and radians.
-            seed: of the window.
+            scans: (T + 1, bins) depth vectors in metres; not changed in place.
+            steps: (T, 3) true steps in metres and radians; not changed in place.
+            seed: seed of the window.
+
+        Returns:
+            The changed scans and steps, same shapes.
         """
-        # Not the generator of the turns, which so are the same with and without these.
+        # The turns have a generator of their own, so that these options do not change them.
         rng = np.random.default_rng([seed, 1])
         scans, steps = np.array(scans), np.array(steps)
         if self.max_range_scale != 1:
@@ -143,24 +156,24 @@ class Augmentation:
         if self.move or self.beam_pattern:
             beams, moves = self._draw_beams(rng), self._draw_moves(len(steps), rng)
             for number, scan in enumerate(scans):
-                scans[number], moves[number] = self._see(scan, moves[number], beams, rng)
+                scans[number], moves[number] = self._view_scan(scan, moves[number], beams, rng)
             if self.move:
                 steps = moved_steps(steps, moves)
         if self.lost_beams or self.lost_sector_deg or self.noise:
-            self._lose(scans, rng)
+            self._drop_returns_and_add_noise(scans, rng)
         return scans, steps
 
     def _draw_moves(self, count: int, rng: np.random.Generator) -> FloatArray:
-        """Where the scans of a window are seen from (count + 1, 3): the first from its own place.
+        """Draws virtual poses (count + 1, 3) relative to the scans' own poses; the first is zero.
 
-        How large the moves are, and how much of each is left in the next one, is drawn for the whole window:
-        some shake from scan to scan, others drift.
+        The size of the moves and their correlation from scan to scan are drawn once for a window: the
+        poses of some windows jump from scan to scan, and those of others drift slowly.
         """
         moves = np.zeros((count + 1, 3))
         if not self.move:
             return moves
         ahead, left, turned = self.move
-        largest = 10 ** rng.uniform(*MOVES) * np.array([ahead, left, math.radians(turned)])
+        largest = 10 ** rng.uniform(*MOVE_SCALE_POWERS) * np.array([ahead, left, math.radians(turned)])
         kept = rng.uniform()
         moves[1:] = largest * rng.standard_normal((count, 3))
         for number in range(2, count + 1):
@@ -168,12 +181,12 @@ class Augmentation:
         return moves
 
     def _draw_beams(self, rng: np.random.Generator) -> Beams | None:
-        """The beams of a window; None: those of its scans."""
+        """Draws the virtual laser of a window; None: scans keep their beams."""
         if not self.beam_pattern:
             return None
         least, largest = self.beam_pattern
         is_irregular = least <= VELODYNE.step_deg <= largest and rng.random() < VELODYNE_SHARE
-        spacing = float(least * (largest / least) ** (rng.integers(SPACINGS) / (SPACINGS - 1)))
+        spacing = float(least * (largest / least) ** (rng.integers(SPACING_COUNT) / (SPACING_COUNT - 1)))
         if is_irregular:
             spacing = VELODYNE.step_deg / 2
         view = self.sensor.field_of_view_deg
@@ -184,23 +197,28 @@ class Augmentation:
         grid = Sensor(spacing, view, self.sensor.max_range, self.sensor.facing_deg)
         return Beams(grid, math.radians(spacing) * rng.uniform(-0.5, 0.5), is_irregular)
 
-    def _see(
+    def _view_scan(
         self, scan: DepthVectors, move: FloatArray, beams: Beams | None, rng: np.random.Generator
     ) -> tuple[DepthVectors, FloatArray]:
-        """A scan (bins,) as seen from another place, and that (3,): half as far as long as little is left."""
-        wanted = LEAST_SEEN * np.count_nonzero(scan)
-        if beams:  # wider apart than the bins, they see less from wherever it is
+        """Views a scan (bins,) from a virtual pose (3,); halves the move while too few returns remain.
+
+        Returns:
+            The new scan (bins,) and the move (3,) that was applied.
+        """
+        wanted = MIN_VISIBLE_SHARE * np.count_nonzero(scan)
+        if beams:  # Beams wider apart than the bins have fewer returns from any pose.
             wanted *= min(1.0, self.sensor.resolution_deg / beams.grid.resolution_deg)
-        for halving in range(MOST_HALVINGS + 1):
-            seen = self._look(scan, move, beams, rng)
+        for halving in range(MAX_HALVINGS + 1):
+            seen = self._render_scan(scan, move, beams, rng)
             if not move.any() or np.count_nonzero(seen) >= wanted:
                 break
-            move = move / 2 if halving + 1 < MOST_HALVINGS else np.zeros(3)
+            move = move / 2 if halving + 1 < MAX_HALVINGS else np.zeros(3)
         return seen, move
 
-    def _look(
+    def _render_scan(
         self, scan: DepthVectors, move: FloatArray, beams: Beams | None, rng: np.random.Generator
     ) -> DepthVectors:
+        """Renders a scan (bins,) from a virtual pose (3,) with other beams."""
         if beams is None:
             return reproject(scan, self.sensor, move) if move.any() else scan
         ranges = render(scan, self.sensor, move + np.array([0, 0, beams.phase]), beams.grid)
@@ -208,8 +226,8 @@ class Augmentation:
         if is_circle:
             ranges = ranges[:-1]
         if beams.is_irregular:
-            luck = rng.random(len(ranges), np.float32)
-            _keep_shots(ranges, luck, VELODYNE.half_steps)
+            draws = rng.random(len(ranges), np.float32)
+            _keep_fired_beams(ranges, draws, VELODYNE.half_steps)
         first = beams.grid.first_bin_deg - self.sensor.first_bin_deg + math.degrees(beams.phase)
         width = self.sensor.resolution_deg
         encoded: DepthVectors = _encode_beams(
@@ -217,23 +235,29 @@ class Augmentation:
         )
         return encoded
 
-    def _lose(self, scans: DepthVectors, rng: np.random.Generator) -> None:
-        """Takes returns out of scans (T + 1, bins), and adds noise to the others."""
+    def _drop_returns_and_add_noise(self, scans: DepthVectors, rng: np.random.Generator) -> None:
+        """Adds noise to the returns of scans (T + 1, bins) and removes some of them, in place."""
         distinct = self.sensor.bins - (self.sensor.field_of_view_deg == 360)
         share = rng.uniform(0, self.lost_beams)
         deviation = rng.uniform(0, self.noise)
         sector = round(rng.uniform(0, self.lost_sector_deg) / self.sensor.resolution_deg)
         first = int(rng.integers(distinct - (sector if distinct == self.sensor.bins else 0)))
-        # One for each return: most bins of a fine sensor have none.
+        # Random numbers are drawn per return, since most bins of a fine sensor are empty.
         count = np.count_nonzero(scans)
-        luck = rng.random(count if share else 0, np.float32)
+        draws = rng.random(count if share else 0, np.float32)
         errors = rng.standard_normal(count if deviation else 0, np.float32)
         errors *= np.float32(deviation)
-        _spoil(scans, distinct, luck, np.float32(share), errors, first, sector, self.sensor.max_range)
+        _add_noise_and_drop(
+            scans, distinct, draws, np.float32(share), errors, first, sector, self.sensor.max_range
+        )
 
 
 def moved_steps(steps: FloatArray, moves: FloatArray) -> FloatArray:
-    """The steps (T, 3) between the places (T + 1, 3) that are seen from those of the scans.
+    """Steps (T, 3) between virtual poses.
+
+    Args:
+        steps: (T, 3) steps between the scans' own poses, metres and radians.
+        moves: (T + 1, 3) virtual poses, each in the frame of its scan, metres and radians.
 
     >>> ahead = np.array([[1.0, 0.0, 0.0]])
     >>> moved_steps(ahead, np.array([[0.0, 0.0, np.pi / 2], [0.5, 0.0, 0.0]])).round(6).tolist()
@@ -244,12 +268,15 @@ def moved_steps(steps: FloatArray, moves: FloatArray) -> FloatArray:
 
 
 @compiled
-def _keep_shots(ranges, luck, half_steps):  # type: ignore[no-untyped-def]
-    """Takes out those of beams (B,), half steps of a Velodyne, that it does not shoot; luck is (B,)."""
+def _keep_fired_beams(ranges, draws, half_steps):  # type: ignore[no-untyped-def]
+    """Sets ranges (B,) of beams that a Velodyne would not fire to 0; ``draws`` (B,) are in [0, 1).
+
+    Neighbouring beams are half a step of the Velodyne apart.
+    """
     following, shots = 0, 0
     for beam in range(len(ranges)):
         if beam == following:
-            following += 1 if luck[shots] < half_steps else 2
+            following += 1 if draws[shots] < half_steps else 2
             shots += 1
         else:
             ranges[beam] = 0
@@ -257,7 +284,15 @@ def _keep_shots(ranges, luck, half_steps):  # type: ignore[no-untyped-def]
 
 @compiled
 def _encode_beams(ranges, first, spacing, bins, is_circle):  # type: ignore[no-untyped-def]
-    """Mean depth (bins,) of beams (B,) of a first place and a spacing in bins; 0 is no return."""
+    """Encodes ranges (B,) as mean depths (bins,); a range or depth of 0 is no return.
+
+    Args:
+        ranges: metres.
+        first: direction of the first beam in bins.
+        spacing: angle between the beams in bins.
+        bins: number of bins.
+        is_circle: whether the last bin repeats the first.
+    """
     distinct = bins - 1 if is_circle else bins
     total, number = np.zeros(distinct), np.zeros(distinct)
     for beam in range(len(ranges)):
@@ -278,10 +313,18 @@ def _encode_beams(ranges, first, spacing, bins, is_circle):  # type: ignore[no-u
 
 
 @compiled
-def _spoil(scans, distinct, luck, share, errors, first, sector, max_range):  # type: ignore[no-untyped-def]
-    """Takes out the returns of scans (T + 1, bins) whose luck is less than a share, and a sector of bins.
+def _add_noise_and_drop(scans, distinct, draws, share, errors, first, sector, max_range):  # type: ignore[no-untyped-def]
+    """Adds errors to returns of scans (T + 1, bins); drops those with a draw below ``share``, and a sector.
 
-    Luck and errors are those of the returns, in order; one of them may be empty.
+    Args:
+        scans: changed in place.
+        distinct: number of bins without the repeated last one of a full circle.
+        draws: one number in [0, 1) for each return, in order; or empty.
+        share: share of the returns that are dropped.
+        errors: metres, one for each return, in order; or empty.
+        first: first bin of the sector.
+        sector: width of the sector in bins.
+        max_range: metres; a range beyond it becomes empty.
     """
     number = 0
     for scan in scans:
@@ -291,7 +334,7 @@ def _spoil(scans, distinct, luck, share, errors, first, sector, max_range):  # t
                     scan[k] += errors[number]
                     if not 0 < scan[k] < max_range:
                         scan[k] = 0
-                if len(luck) and luck[number] < share:
+                if len(draws) and draws[number] < share:
                     scan[k] = 0
                 number += 1
         for k in range(first, first + sector):

@@ -1,4 +1,4 @@
-"""The moving average of a training's weights, which is what validates and is kept."""
+"""The moving average of the weights, which is validated and saved as the best checkpoint."""
 
 from functools import partial
 
@@ -9,16 +9,16 @@ from torch.optim.swa_utils import get_ema_multi_avg_fn
 
 
 class Averaging(WeightAveraging):
-    """Keeps an exponential moving average of the weights over the steps, ``model.averaging``.
+    """Keeps an exponential moving average of the weights over the training steps, ``model.averaging``.
 
-    Validation and the best checkpoint have the averaged weights; training goes on with its own. A checkpoint
-    to go on from has both. Buffers (scales, units) are the network's own, never averages.
+    Validation and the best checkpoint use the averaged weights, and the training steps the raw ones. The last
+    checkpoint has both. Buffers (scales, units) are not averaged.
 
-    It comes before the other callbacks, so that a step is in the average before it is saved.
+    This callback must come before the others, so that a step is part of the average before it is saved.
 
     Args:
-        decay: what is left of the average before a step, from 0 and below 1; less in the first steps, see
-            :func:`decay_after`.
+        decay: factor of the previous average at each step, from 0 and below 1. It is smaller in the first
+            steps, see :func:`decay_after`.
     """
 
     def __init__(self, decay: float) -> None:
@@ -26,31 +26,31 @@ class Averaging(WeightAveraging):
         self._in_use = False
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """Makes the average where the network will be, which has not been moved to its device yet."""
+        """Creates the average on the device of the training; the network is moved there later."""
         self._device = trainer.strategy.root_device
         super().setup(trainer, pl_module, stage)
 
     def on_validation_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Lets the network have the averaged weights."""
+        """Gives the network the averaged weights."""
         super().on_validation_epoch_start(trainer, pl_module)
         self._in_use = True
 
     def on_validation_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Leaves the network the averaged weights.
+        """Keeps the averaged weights in the network.
 
-        Lightning would take them away here, before the best checkpoint is saved, which so would have the
-        weights that were not validated.
+        Lightning would restore the raw weights here, before the best checkpoint is saved. The checkpoint
+        would then have other weights than those that were validated.
         """
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Gives the network its own weights back, before they are saved to go on from."""
-        if self._in_use:  # a process that has no drive to validate has kept its own
+        """Gives the network its raw weights back, before the last checkpoint is saved."""
+        if self._in_use:  # False in a process that had no drive to validate.
             self._swap_models(pl_module)
             self._in_use = False
 
 
 def decay_after(steps: int, decay: float) -> float:
-    """The decay of the average after so many steps: less at first, so that random weights do not linger.
+    """The decay of the average after a number of steps; small at first, to drop the random weights.
 
     >>> [round(decay_after(steps, 0.99), 2) for steps in (0, 10, 100, 1000)]
     [0.1, 0.55, 0.92, 0.99]
@@ -59,11 +59,11 @@ def decay_after(steps: int, decay: float) -> float:
 
 
 def _update(decay: float, averages: list[Tensor], weights: list[Tensor], steps: Tensor) -> None:
-    """Takes the weights after a step into their averages, in place.
+    """Updates the averages with the weights after a step, in place.
 
     Args:
-        decay: once the first steps are over.
-        averages, weights: of all parameters.
-        steps: how many are in the averages.
+        decay: decay after the first steps.
+        averages, weights: average and weights of each parameter.
+        steps: number of steps in the averages.
     """
     get_ema_multi_avg_fn(decay_after(int(steps), decay))(averages, weights, steps)

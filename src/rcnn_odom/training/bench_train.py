@@ -1,7 +1,8 @@
-"""How fast training is, against a plain loop: ``make bench-train``.
+"""Measures the speed of training in comparison with a simple training loop: ``make bench-train``.
 
-Every way runs in a process of its own, since what ours asks of the memory allocator would help the plain
-loop too, and all take turns, so that a machine that others use as well slows down all of them alike.
+Each measurement runs in its own process, since this project's settings of the memory allocator would also
+speed up the simple loop. The measurements take turns, so that other programs on the machine slow down all of
+them alike.
 """
 
 import multiprocessing
@@ -32,36 +33,39 @@ from rcnn_odom.training.settings import plain
 from rcnn_odom.training.stages import build_datamodule, build_module, build_trainer
 
 CASES = {"CNN, batches of 64": "cnn_reg", "RCNN, 16 windows of 16": "rcnn_reg"}
-"""Model by name, with the recipe's batches."""
+"""Models by the name of the case, with the batches of the recipe."""
 ROUNDS, WARM_UP, SECONDS = 3, 3, 6.0
-"""In each round, of every way: steps before the clock starts, and for how long steps are timed after them."""
+"""Number of rounds; in each of them, the number of untimed steps, and seconds of timed steps after them."""
 FRAMES, EPOCH = 1500, 16500
-"""Of the simulated drive that is trained on, and of an epoch, about as long as KITTI's: that drive over and
-over."""
+"""Frames of the simulated drive, and of an epoch, which repeats the drive; about as many as KITTI has."""
 
 
 class Pace(Callback):
-    """Frames a second, without those of the first steps.
+    """Measures the training speed after the first steps.
 
     Attributes:
-        frames, seconds: of the timed steps.
+        frames, seconds: frames and seconds of the timed steps.
     """
 
-    class Known(Exception):
+    class Finished(Exception):
         """Enough steps have been timed."""
 
     def __init__(self) -> None:
         self.steps, self.frames, self.start, self.seconds = 0, 0, 0.0, 0.0
 
     def count(self, frames: int) -> None:
-        """After a step of so many frames."""
+        """Counts a step with this number of frames.
+
+        Raises:
+            Finished: enough steps have been timed.
+        """
         self.steps += 1
         if self.steps == WARM_UP:
             self.start = time.perf_counter()
         elif self.steps > WARM_UP:
             self.frames, self.seconds = self.frames + frames, time.perf_counter() - self.start
         if self.seconds > SECONDS:
-            raise self.Known
+            raise self.Finished
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
@@ -71,7 +75,7 @@ class Pace(Callback):
 
 
 def settings_of(model: str, precision: str, outputs: str) -> Settings:
-    """The default settings of a training on one simulated drive."""
+    """The default settings of a model, for training on one simulated drive."""
     options = [f"model={model}", f"trainer.precision={precision}", "trainer.accelerator=cpu"]
     options += [f"data.frames={FRAMES}", "data.train=['00']", "data.val=['10']", "data.test=['10']"]
     options += ["data.fresh_worlds=false", f"outputs={outputs}", f"run_dir={outputs}/run"]
@@ -80,18 +84,18 @@ def settings_of(model: str, precision: str, outputs: str) -> Settings:
 
 
 def ours(settings: Settings) -> float:
-    """Frames a second of this project's training, by Lightning with all its callbacks."""
+    """Frames per second of this project's training with Lightning and all callbacks."""
     pace, datamodule = Pace(), build_datamodule(settings).load()
     datamodule.drives["train"] *= EPOCH // FRAMES
     trainer = build_trainer(settings, Path(settings["run_dir"]))
     trainer.callbacks.append(pace)  # type: ignore[attr-defined]
-    with suppress(Pace.Known):
+    with suppress(Pace.Finished):
         trainer.fit(build_module(settings, datamodule), datamodule=datamodule)
     return pace.frames / pace.seconds
 
 
 class PlainNetwork(nn.Module):
-    """The paper's network as one would write it down: ``Conv1d``, ``LSTM``, a linear layer."""
+    """The paper's network in standard PyTorch: ``Conv1d``, ``LSTM``, a linear layer."""
 
     def __init__(self, sensor: Sensor, hidden: int | None) -> None:
         super().__init__()
@@ -110,7 +114,7 @@ class PlainNetwork(nn.Module):
         self.head = nn.Linear(hidden or features, 2)
 
     def forward(self, pairs: Tensor) -> Tensor:
-        """Motions (B, T, 2) of pairs (B, T, 2, bins)."""
+        """Estimates motions (B, T, 2) of pairs (B, T, 2, bins)."""
         features = self.encoder(pairs.flatten(0, 1) / self.max_range).flatten(1).unflatten(0, pairs.shape[:2])
         if self.lstm is not None:
             features, _ = self.lstm(torch.cat([features, self.first(features)], -1))
@@ -118,7 +122,7 @@ class PlainNetwork(nn.Module):
 
 
 def plain_loop(settings: Settings) -> float:
-    """Frames a second of a plain loop: fp32, Adam as it comes, a DataLoader of single windows."""
+    """Frames per second of a simple training loop: fp32, default Adam, a DataLoader of single windows."""
     options, sensor = settings["model"], Sensor(**settings["data"]["sensor"])
     [drive] = build_datamodule(settings).load(("train",)).drives["train"]
     scans, motions = (
@@ -129,7 +133,7 @@ def plain_loop(settings: Settings) -> float:
     windows: Any = [(pairs[i : i + window], motions[i : i + window]) for i in range(len(pairs) - window + 1)]
     network, pace = PlainNetwork(sensor, options.get("hidden_size")), Pace()
     optimizer = torch.optim.Adam(network.parameters(), options["learning_rate"])
-    with suppress(Pace.Known):
+    with suppress(Pace.Finished):
         while True:
             for inputs, truth in DataLoader(windows, options["batch_size"], shuffle=True, drop_last=True):
                 optimizer.zero_grad()
@@ -145,14 +149,14 @@ WAYS = {
     "ours, fp32": (ours, "32-true"),
     "ours, bf16": (ours, "bf16-mixed"),
 }
-"""What measures, and Lightning's precision, by name; the plain loop first."""
+"""The measuring function and the precision by name; the simple loop comes first, for comparison."""
 
 
 def report(paces: dict[str, dict[str, list[float]]]) -> str:
-    """A table of the medians of all rounds.
+    """Formats a table of the medians of all rounds.
 
     Args:
-        paces: frames a second by case and way.
+        paces: frames per second by case and by name in ``WAYS``.
     """
     rows = [[f"frames a second, {torch.get_num_threads()} threads", "median", "times plain"]]
     for case, found in paces.items():
@@ -165,7 +169,7 @@ def report(paces: dict[str, dict[str, list[float]]]) -> str:
 
 
 def main() -> None:
-    """Measures and prints."""
+    """Measures all cases and prints the table."""
     paces: dict[str, dict[str, list[float]]] = {case: {way: [] for way in WAYS} for case in CASES}
     turns = [(case, way) for _ in range(ROUNDS) for case in CASES for way in WAYS]
     with TemporaryDirectory() as outputs:

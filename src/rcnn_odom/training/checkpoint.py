@@ -1,4 +1,4 @@
-"""Trained networks from disk, never trusting the file with more than numbers."""
+"""Loads trained networks from checkpoints. Only plain data is loaded, so that a file cannot run code."""
 
 import hashlib
 from dataclasses import asdict
@@ -17,40 +17,40 @@ from rcnn_odom.training.modules import OdometryModule, module_for
 from rcnn_odom.training.saving import AtomicCheckpointIO
 
 ARCHIVE = b"PK\x03\x04"
-"""How every file of ``torch.save`` begins."""
+"""First bytes of every file that ``torch.save`` writes."""
 GIVE = "give RUN/checkpoints/best.ckpt of a run"
 
-OLD_PLACES = {
+OLD_PREFIXES = {
     "network.": "model.",
     "uncertainty.least_filled": "model.least_filled",
     "uncertainty.period": "model.period",
     "uncertainty.": "model.uncertainty.",
 }
-"""Where weights of version 0.1 have gone, by the beginning of their names; the first that fits counts."""
+"""New prefixes of the names of weights of version 0.1; the first that matches is used."""
 
 
 def read_checkpoint(path: str | Path) -> dict[str, Any]:
-    """What a checkpoint holds, its arrays as maps of the file.
+    """Reads a checkpoint; its arrays are memory maps of the file.
 
     Raises:
-        InputError: no such file, or it holds anything but numbers, strings, lists and dictionaries: objects
-            could run a stranger's code.
+        InputError: there is no such file, or it has other objects than tensors, numbers, strings, lists and
+            dictionaries. Such objects could run code.
     """
     _check_beginning(Path(path))
     try:
         saved = torch.load(path, map_location="cpu", weights_only=True, mmap=True)
         if not isinstance(saved, dict):
             raise TypeError(f"it holds a {type(saved).__name__}")
-    except Exception as error:  # whatever the bytes of a stranger's file lead to
-        raise _refusal(path, error) from error
+    except Exception as error:  # A damaged or foreign file can raise any error.
+        raise _checkpoint_error(path, error) from error
     return saved
 
 
 def _check_beginning(path: Path) -> None:
-    """Refuses a file that is plainly no checkpoint, of which torch would say much.
+    """Refuses a file that is clearly not a checkpoint, for which torch has only long messages.
 
     Raises:
-        InputError: there is no such file, or it is a folder, empty, or no archive as torch writes them.
+        InputError: there is no such file, or it is a folder, empty, or not an archive of ``torch.save``.
     """
     try:
         with path.open("rb") as file:
@@ -64,9 +64,10 @@ def _check_beginning(path: Path) -> None:
         raise InputError(f"{path}: {what}; {GIVE}")
 
 
-def _refusal(path: str | Path, error: Exception) -> InputError:
+def _checkpoint_error(path: str | Path, error: Exception) -> InputError:
+    """The error for a file that is not a checkpoint of this project."""
     reason = f"{type(error).__name__}: {error}".splitlines()[0]
-    if isinstance(error, UnpicklingError):  # torch adds how to load it all the same
+    if isinstance(error, UnpicklingError):  # Its message tells how to load the file nevertheless.
         reason = "it holds more than numbers"
     return InputError(
         f"{path}: not a checkpoint of this project, or of an older version ({reason}); train again"
@@ -74,15 +75,16 @@ def _refusal(path: str | Path, error: Exception) -> InputError:
 
 
 def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | None = None) -> OdometryModule:
-    """The trained module of a checkpoint, on the CPU, in evaluation mode.
+    """Loads the trained module of a checkpoint, on the CPU and in evaluation mode.
 
     Args:
         path: a ``.ckpt`` file of a run, also of version 0.1.
-        variant: the model that it must be of; None for any.
-        sensor: which it must have been trained for; None for any.
+        variant: the required model; None: any.
+        sensor: the required sensor; None: any.
 
     Raises:
-        InputError: no such file, not a checkpoint of this project, of another model or sensor.
+        InputError: there is no such file, it is not a checkpoint of this project, or it has another model or
+            sensor.
     """
     saved = read_checkpoint(path)
     try:
@@ -92,8 +94,8 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
         found = settings["variant"]
         module = module_for(found)(settings["model"], settings["sensor"], settings["lengths"])
         module.load_state_dict(saved["state_dict"])
-    except Exception as error:  # whatever a stranger's file holds
-        raise _refusal(path, error) from error
+    except Exception as error:  # A damaged or foreign file can raise any error.
+        raise _checkpoint_error(path, error) from error
     if variant is not None and found != variant:
         raise InputError(f"{path}: a checkpoint of {found}, but {variant} is needed")
     if sensor is not None:
@@ -102,16 +104,21 @@ def load_module(path: str | Path, variant: str | None = None, sensor: Sensor | N
 
 
 def _compare_sensors(path: str | Path, own: Sensor, sensor: Sensor) -> None:
-    """Refuses a network whose sensor is another one than the data's; names what differs.
+    """Compares the sensor of a network with that of the data.
+
+    Args:
+        path: path of the checkpoint.
+        own: the sensor of the network.
+        sensor: the sensor of the data.
 
     Raises:
-        InputError: it is.
+        InputError: they differ; the message names the differences.
     """
-    theirs, ours = asdict(own), asdict(sensor)
-    others = [name for name in ours if theirs[name] != ours[name]]
-    if others:
-        need = " ".join(f"data.sensor.{name}={theirs[name]}" for name in others)
-        have = " and ".join(f"{name}={ours[name]}" for name in others)
+    trained, given = asdict(own), asdict(sensor)
+    different = [name for name in given if trained[name] != given[name]]
+    if different:
+        need = " ".join(f"data.sensor.{name}={trained[name]}" for name in different)
+        have = " and ".join(f"{name}={given[name]}" for name in different)
         raise InputError(
             f"{path}: trained with {need}, but the data has {have}; set data.sensor as in training, or train "
             "on this data"
@@ -119,26 +126,26 @@ def _compare_sensors(path: str | Path, own: Sensor, sensor: Sensor) -> None:
 
 
 def weights_fingerprint(path: str | Path) -> str:
-    """Hash of the weights and scales in a checkpoint, wherever the file is.
+    """Hash of the weights and buffers in a checkpoint; it does not depend on the file's name.
 
     Raises:
-        InputError: as :func:`read_checkpoint`.
+        InputError: see :func:`read_checkpoint`.
     """
     saved, digest = read_checkpoint(path), hashlib.sha256()
     try:
         for name, value in sorted(saved["state_dict"].items()):
             digest.update(f"{name} {value.dtype} {tuple(value.shape)}".encode())
             digest.update(value.contiguous().view(-1).numpy().tobytes())
-    except Exception as error:  # whatever a stranger's file holds
-        raise _refusal(path, error) from error
+    except Exception as error:  # A damaged or foreign file can raise any error.
+        raise _checkpoint_error(path, error) from error
     return digest.hexdigest()[:16]
 
 
 def _upgrade(saved: dict[str, Any]) -> None:
-    """Brings a checkpoint of version 0.1 into today's form.
+    """Converts a checkpoint of version 0.1 to the present format, in place.
 
-    There a network knew two numbers only: ``apply`` stood beside the lengths of the validation drift, and
-    nothing was known of steps.
+    The networks of version 0.1 estimated two numbers, distance and heading change. ``apply`` was stored
+    beside the lengths of the validation drift, and there were no statistics of steps.
     """
     settings, old = saved["hyper_parameters"], saved["state_dict"]
     scoring = settings.pop("scoring")
@@ -147,8 +154,8 @@ def _upgrade(saved: dict[str, Any]) -> None:
     settings["lengths"] = scoring["lengths"]
     weights = {}
     for name, value in old.items():
-        before = next(beginning for beginning in OLD_PLACES if name.startswith(beginning))
-        weights[OLD_PLACES[before] + name.removeprefix(before)] = value
+        prefix = next(old for old in OLD_PREFIXES if name.startswith(old))
+        weights[OLD_PREFIXES[prefix] + name.removeprefix(prefix)] = value
     mean, deviation = (old[f"network.head.{name}"].double() for name in ("mean", "deviation"))
     distance, turn = (mean.square() + deviation.square()).sqrt().tolist()
     weights["mean_step"] = torch.from_numpy(steps_of(mean.numpy(), scoring["apply"])).float()
@@ -158,17 +165,17 @@ def _upgrade(saved: dict[str, Any]) -> None:
 
 
 def calibrate(path: Path, drives: list[Drive]) -> OdometryModule:
-    """Fits what a checkpoint's model knows of validation drives and keeps it in the checkpoint.
+    """Calibrates the model of a checkpoint on validation drives and saves the result in the checkpoint.
 
     Args:
-        path: a ``.ckpt`` file of a run; it changes at once or not at all.
-        drives: validation drives with their truth.
+        path: a ``.ckpt`` file of a run; it is replaced atomically.
+        drives: validation drives with ground truth.
 
     Returns:
-        The module, as :func:`load_module` gives it.
+        The calibrated module.
 
     Raises:
-        InputError: as :func:`load_module`.
+        InputError: see :func:`load_module`.
     """
     module = load_module(path)
     module.model.calibrate(drives)

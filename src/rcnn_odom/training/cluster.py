@@ -1,8 +1,8 @@
-"""One command in processes that torchrun or Slurm has started, perhaps on several machines.
+"""Runs one command in processes that torchrun or Slurm has started, possibly on several machines.
 
-The first process runs the command. The others only take part when it trains or tests, and wait in between. So
-whatever must happen once (the run's folder, logs, encoding, locks, scores) happens once, and two processes
-cannot wait for each other's lock.
+The first process runs the command. The others only take part in training and testing, and wait otherwise. So
+everything that must happen once (the run's folder, logs, encoding, locks, scores) happens once, and processes
+cannot wait for each other's locks.
 """
 
 import os
@@ -18,37 +18,37 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from rcnn_odom.errors import InputError
 
-if TYPE_CHECKING:  # both with torch, which would make --help slow
+if TYPE_CHECKING:  # Both import torch, which would make --help slow.
     import lightning as L
     from lightning.fabric.plugins.environments import ClusterEnvironment
 
     from rcnn_odom.training.datamodule import OdometryDataModule
 
-PATIENCE = timedelta(days=1)
-"""How long processes wait for each other: the first one encodes, or waits for another training, alone."""
+CONNECTION_TIMEOUT = timedelta(days=1)
+"""Longest time that processes wait, while the first one encodes or waits for another training."""
 POLLING = 0.1
-"""Seconds between looks for the next piece of work; signals are noticed in between."""
-FAREWELL = 5.0
-"""Seconds that the last word of a process has to reach the others."""
-SEEN_WITHIN = 30.0
-"""Seconds after which a new file is seen on every node; NFS may keep an older listing of a folder so long."""
+"""Seconds between checks for new work; signals are handled in between."""
+MESSAGE_TIMEOUT = 5.0
+"""Seconds for the last message of a process to reach the others."""
+FILE_TIMEOUT = 30.0
+"""Seconds until a new file is visible on every node; NFS can cache the listing of a folder so long."""
 
 TORCHRUN = ("RANK", "WORLD_SIZE", "LOCAL_RANK", "LOCAL_WORLD_SIZE")
-"""Variables of which each says that torchrun has started this process."""
+"""Environment variables that torchrun sets; any of them shows that it has started this process."""
 ADDRESS = ("MASTER_ADDR", "MASTER_PORT")
 SLURM = ("SLURM_PROCID", "SLURM_NTASKS", "SLURM_LOCALID", "SLURM_NTASKS_PER_NODE")
-"""Variables of a task that srun has started: the same numbers as those of torchrun."""
-BY_THE_SAME = "the same command goes on from the last checkpoint"
+"""Environment variables of a task of srun, with the same meaning as those of torchrun."""
+CONTINUE_ADVICE = "the same command continues from the last checkpoint"
 
 
 class World(NamedTuple):
-    """The processes that something else has started for one command.
+    """The processes that torchrun or Slurm has started for one command.
 
     Attributes:
-        starter: who has, in words.
+        starter: ``torchrun`` or ``srun``.
         rank: number of this process, from 0.
-        size: how many processes there are.
-        per_node: how many of them on each node.
+        size: number of processes.
+        per_node: number of processes on each node.
     """
 
     starter: str
@@ -58,21 +58,29 @@ class World(NamedTuple):
 
     @property
     def nodes(self) -> int:
-        """How many machines there are."""
+        """Number of machines."""
         return self.size // self.per_node
 
 
 def find_world(variables: Mapping[str, str] = os.environ) -> World | None:
-    """What torchrun or Slurm says about this process; None: nobody but this command starts processes.
+    """Reads from environment variables which processes torchrun or Slurm has started.
 
-    A job of Slurm with one task starts its own processes, as does a command that was not started by ``srun``.
+    Returns:
+        None if the command starts its own processes. This includes a Slurm job with one task, and a command
+        in a Slurm job that was not started by ``srun``.
 
     Raises:
-        InputError: variables are missing, or make no sense together.
+        InputError: variables are missing or contradict each other.
+
+    >>> find_world({"RANK": "1", "WORLD_SIZE": "2", "LOCAL_RANK": "0", "LOCAL_WORLD_SIZE": "1",
+    ...             "MASTER_ADDR": "localhost", "MASTER_PORT": "29500"})
+    World(starter='torchrun', rank=1, size=2, per_node=1)
+    >>> find_world({}) is None
+    True
     """
     if any(name in variables for name in TORCHRUN):
         return _read_world("torchrun", variables, TORCHRUN, ADDRESS)
-    # A batch script has SLURM_NTASKS too, but is not one of the tasks.
+    # A batch script also has SLURM_NTASKS, but is not a task.
     if variables.get("SLURM_NTASKS", "1") != "1" and "SLURM_STEP_ID" in variables:
         return _read_world("srun", variables, SLURM, ())
     return None
@@ -81,6 +89,14 @@ def find_world(variables: Mapping[str, str] = os.environ) -> World | None:
 def _read_world(
     starter: str, variables: Mapping[str, str], names: tuple[str, ...], others: tuple[str, ...]
 ) -> World:
+    """Reads the rank, size, local rank and local size from variables.
+
+    Args:
+        starter: ``torchrun`` or ``srun``.
+        variables: the environment variables.
+        names: names of the variables with these four numbers.
+        others: names of further required variables.
+    """
     wanted = (*names, *others)
     missing = [name for name in wanted if not variables.get(name)]
     if missing:
@@ -92,36 +108,36 @@ def _read_world(
     except ValueError:
         rank, size, local_rank, per_node = -1, 0, 0, 1
     if not (0 <= rank < size and 0 <= local_rank < per_node and size % per_node == 0):
-        told = " ".join(f"{name}={variables[name]}" for name in names)
-        raise InputError(f"{told}: these do not fit together; {starter} must start as many on every node")
+        values = " ".join(f"{name}={variables[name]}" for name in names)
+        raise InputError(f"{values}: these contradict each other; {starter} must start as many on every node")
     return World(starter, rank, size, per_node)
 
 
 def refuse_sweep(world: World | None) -> None:
-    """For a sweep, whose jobs the processes could not agree on.
+    """Refuses a sweep in several processes, which could not agree on its jobs.
 
     Raises:
         InputError: there are several processes.
     """
     if world and world.size > 1:
         raise InputError(
-            f"-m: {world.starter} has started {world.size} processes, which train one run; start the sweep "
-            "by python, or train its runs one by one"
+            f"-m: {world.starter} has started {world.size} processes for a single run; start the sweep by "
+            "python, or train its runs one by one"
         )
 
 
 def environment_of(world: World) -> "ClusterEnvironment":
-    """What Lightning asks about the processes.
+    """Lightning's cluster environment for these processes.
 
     Raises:
-        InputError: it does not accept what Slurm says.
+        InputError: Lightning does not accept the variables of Slurm.
     """
     from lightning.pytorch.plugins.environments import SLURMEnvironment, TorchElasticEnvironment
 
     if world.starter == "torchrun":
         return TorchElasticEnvironment()
     try:
-        # A run saves and goes on by itself; Lightning would write checkpoints of its own.
+        # Runs save and resume without Lightning, which would write further checkpoints.
         return SLURMEnvironment(auto_requeue=False)
     except RuntimeError as error:
         raise InputError(" ".join(str(error).split())) from error
@@ -129,14 +145,14 @@ def environment_of(world: World) -> "ClusterEnvironment":
 
 @dataclass
 class Work:
-    """What the first process lets all of them do.
+    """A training or test that the first process asks all processes to do.
 
     Attributes:
-        build: picklable; makes the Trainer of a process.
-        name: of what the Trainer does, ``fit`` or ``test``.
-        module, datamodule, options: arguments of that.
-        keys: of the drives by split, to compare.
-        marks: files that every process must see.
+        build: picklable function that builds the Trainer of a process.
+        name: method of the Trainer, ``fit`` or ``test``.
+        module, datamodule, options: arguments of that method.
+        keys: keys of the drives by split, for a comparison.
+        marks: files that must be visible to every process.
     """
 
     build: "Callable[[], L.Trainer]"
@@ -150,70 +166,84 @@ class Work:
 
 @dataclass
 class _Team:
+    """The connected processes.
+
+    Attributes:
+        world: the processes.
+        store: torch's Store, a dictionary that all processes share.
+        works: number of trainings and tests so far.
+    """
+
     world: World
-    store: Any  # torch's Store: a dictionary that all processes see
+    store: Any
     works: int = 0
 
 
 _team: _Team | None = None
-"""Of this process, once it has met the others."""
+"""The processes that this one is connected to; None before."""
 
 
 def has_joined() -> bool:
-    """Whether this process works together with others that it has not started."""
+    """Whether this process is connected to others that torchrun or Slurm has started."""
     return _team is not None
 
 
 def run_in(world: World, command: Callable[[], int]) -> int:
-    """Runs a command in the first process of several, and follows it in the others; the exit status.
+    """Runs a command in the first process; the others take part in its trainings and tests.
+
+    Returns:
+        The exit status.
 
     Raises:
-        InputError: the processes do not find each other.
+        InputError: the processes cannot connect to each other.
     """
     global _team
-    _team = _meet(world)
+    _team = _connect(world)
     try:
-        return _lead(_team, command) if world.rank == 0 else _follow(_team)
+        return _run_in_first(_team, command) if world.rank == 0 else _work_for_first(_team)
     finally:
         _team = None
 
 
-def _meet(world: World) -> _Team:
+def _connect(world: World) -> _Team:
+    """Connects the processes to each other."""
     import torch.distributed as dist
 
     environment = environment_of(world)
     os.environ["MASTER_ADDR"] = environment.main_address
     os.environ["MASTER_PORT"] = str(environment.main_port)
     try:
-        store, rank, size = next(iter(dist.rendezvous("env://", world.rank, world.size, timeout=PATIENCE)))
-        # No backend is named: gloo for what is said, NCCL for what GPUs compute. Lightning takes it as it is.
-        dist.init_process_group(store=store, rank=rank, world_size=size, timeout=PATIENCE)
-        # The store may be torchrun's, which can hold what other processes have left.
+        store, rank, size = next(
+            iter(dist.rendezvous("env://", world.rank, world.size, timeout=CONNECTION_TIMEOUT))
+        )
+        # Without a backend, torch uses gloo for messages and NCCL for GPUs. Lightning uses the same group.
+        dist.init_process_group(store=store, rank=rank, world_size=size, timeout=CONNECTION_TIMEOUT)
+        # The store may belong to torchrun and have entries of earlier processes, so the prefix is unique.
         name = [uuid.uuid4().hex]
         dist.broadcast_object_list(name, 0)
     except (RuntimeError, ValueError) as error:
         place = f"{os.environ['MASTER_ADDR']}:{os.environ['MASTER_PORT']}"
         reason = str(error).splitlines()[0]
-        raise InputError(f"{place}: the processes do not find each other there ({reason})") from error
+        raise InputError(f"{place}: the processes cannot connect to each other there ({reason})") from error
     return _Team(world, dist.PrefixStore(name[0], store))
 
 
-def _lead(team: _Team, command: Callable[[], int]) -> int:
-    """The first process: its command; the others end with the same status."""
+def _run_in_first(team: _Team, command: Callable[[], int]) -> int:
+    """Runs the command in the first process, and makes the others end with the same exit status."""
     status = 1
     try:
         status = command()
     finally:
-        _leave()
-        with suppress(RuntimeError):  # the one who keeps the store may be gone
+        _disconnect()
+        with suppress(RuntimeError):  # The process with the store may have ended.
             team.store.set("end", str(status))
-            # They may need this process to read it.
-            _wait_until(lambda: team.store.add("gone", 0) == team.world.size - 1, FAREWELL)
+            # This process may have the store that the others read.
+            _wait_until(lambda: team.store.add("gone", 0) == team.world.size - 1, MESSAGE_TIMEOUT)
     return status
 
 
-def _leave() -> None:
-    """Hangs up, so that nobody waits for this process any longer."""
+def _disconnect() -> None:
+    """Closes the connection, so that no process waits for this one."""
     import torch.distributed as dist
 
     with suppress(RuntimeError, ValueError, AssertionError):
@@ -221,30 +251,31 @@ def _leave() -> None:
 
 
 def _wait_until(condition: Callable[[], bool], seconds: float) -> bool:
+    """Waits until a condition is met; returns False if it is not met in time."""
     end = time.monotonic() + seconds
     while not (met := condition()) and time.monotonic() < end:
         time.sleep(POLLING)
     return met
 
 
-def _follow(team: _Team) -> int:
-    """Every other process: works until the first one ends; the exit status."""
+def _work_for_first(team: _Team) -> int:
+    """Works in every other process until the first one ends; returns the exit status."""
     try:
         while (end := _wait_for_work(team)) is None:
-            _do(team)
+            _do_work(team)
         return end
-    except (KeyboardInterrupt, SystemExit):  # the latter is how Lightning ends after Ctrl-C
+    except (KeyboardInterrupt, SystemExit):  # Lightning raises SystemExit after Ctrl-C.
         raise KeyboardInterrupt from None
     except Exception as error:
-        return _end_by(team, error)
+        return _end_after_error(team, error)
     finally:
-        _leave()
+        _disconnect()
         with suppress(RuntimeError):
             team.store.add("gone", 1)
 
 
 def _wait_for_work(team: _Team) -> int | None:
-    """None once there is some, or the exit status if there will be none."""
+    """Waits for work; returns None if there is some, or the exit status if the command has ended."""
     team.works += 1
     while not team.store.check([f"work {team.works}"]):
         if team.store.check(["end"]):
@@ -253,44 +284,51 @@ def _wait_for_work(team: _Team) -> int | None:
     return None
 
 
-def _end_by(team: _Team, error: Exception) -> int:
-    """After an error: the first process tells it, if it is there and has none of its own."""
-    _leave()
+def _end_after_error(team: _Team, error: Exception) -> int:
+    """Sends an error to the first process, which reports it; returns the exit status.
+
+    Raises:
+        InputError: the first process does not answer.
+    """
+    _disconnect()
     is_users = isinstance(error, InputError | OSError)
     with suppress(RuntimeError):
         if is_users:
-            team.store.set("failed", f"{_name(team.world)}: {error}")
-        if (is_users or is_lost(error)) and _wait_until(lambda: team.store.check(["end"]), FAREWELL):
+            team.store.set("failed", f"{_describe_process(team.world)}: {error}")
+        if (is_users or _is_lost_process(error)) and _wait_until(
+            lambda: team.store.check(["end"]), MESSAGE_TIMEOUT
+        ):
             return int(team.store.get("end")) or 1
     if is_users:
         raise error
-    if is_lost(error):
-        raise InputError(f"the first process has ended; {BY_THE_SAME}") from error
+    if _is_lost_process(error):
+        raise InputError(f"the first process has ended; {CONTINUE_ADVICE}") from error
     raise error
 
 
-def _name(world: World) -> str:
+def _describe_process(world: World) -> str:
+    """Rank and machine of this process, for a message."""
     return f"process {world.rank} of {world.size} on {socket.gethostname()}"
 
 
-def is_lost(error: Exception) -> bool:
-    """Whether an error means that another process is not there any longer."""
+def _is_lost_process(error: Exception) -> bool:
+    """Whether an error means that another process has ended."""
     import torch.distributed as dist
 
     return isinstance(error, dist.DistError) or (isinstance(error, RuntimeError) and "gloo" in str(error))
 
 
-def lost(error: Exception) -> Exception:
-    """What the first process raises instead of such an error: what the other one said, if it did."""
-    if _team is None or not is_lost(error):
+def translate_lost_process(error: Exception) -> Exception:
+    """Replaces an error that another process has caused by that process's own message, if it sent one."""
+    if _team is None or not _is_lost_process(error):
         return error
     with suppress(RuntimeError):
-        if _wait_until(lambda: _team.store.check(["failed"]), FAREWELL):  # type: ignore[union-attr]
+        if _wait_until(lambda: _team.store.check(["failed"]), MESSAGE_TIMEOUT):  # type: ignore[union-attr]
             return InputError(_team.store.get("failed").decode())
-    return InputError(f"another process of this training has ended; {BY_THE_SAME}")
+    return InputError(f"another process of this training has ended; {CONTINUE_ADVICE}")
 
 
-def share(
+def start_in_others(
     build: "Callable[[], L.Trainer]",
     name: str,
     module: "L.LightningModule",
@@ -298,16 +336,16 @@ def share(
     folders: list[Path],
     **options: Any,
 ) -> None:
-    """Lets the other processes do what this one does next; nothing where there are none.
+    """Starts the same training or test in the other processes, if there are any.
 
     Args:
-        build: picklable; makes a Trainer like this process' own.
-        name: ``fit`` or ``test``.
-        module, datamodule, options: arguments of that.
-        folders: of files that all processes need.
+        build: picklable function that builds the same Trainer as that of this process.
+        name: method of the Trainer, ``fit`` or ``test``.
+        module, datamodule, options: arguments of that method.
+        folders: folders that all processes must have in common.
 
     Raises:
-        InputError: one of them cannot.
+        InputError: one of the processes cannot take part.
     """
     if _team is None:
         return
@@ -319,12 +357,12 @@ def share(
         _team.works += 1
         _team.store.set(f"work {_team.works}", "")
         dist.broadcast_object_list([work], 0)
-        if reasons := _gather(_team.world, ""):
+        if reasons := _gather_reasons(_team.world, ""):
             raise InputError(reasons[0])
 
 
 def _without_trainer(datamodule: "OdometryDataModule") -> "OdometryDataModule":
-    """A copy for another process, without drives and the Trainer of this one."""
+    """A copy for another process, without drives and without the Trainer."""
     copy = datamodule.__class__.__new__(datamodule.__class__)
     copy.__dict__ |= datamodule.__getstate__() | {"trainer": None}
     return copy
@@ -332,7 +370,7 @@ def _without_trainer(datamodule: "OdometryDataModule") -> "OdometryDataModule":
 
 @contextmanager
 def _marks(folders: list[Path]) -> Iterator[list[Path]]:
-    """Files that nobody else can have made, one in each folder, for as long as the others look for them."""
+    """Creates a file with a unique name in each folder while the other processes look for it."""
     marks = [folder / f".seen-{uuid.uuid4().hex}" for folder in folders]
     try:
         for mark in marks:
@@ -344,8 +382,8 @@ def _marks(folders: list[Path]) -> Iterator[list[Path]]:
             mark.unlink(missing_ok=True)
 
 
-def _gather(world: World, reason: str) -> list[str]:
-    """Reasons of all processes why they cannot work; an empty one is none."""
+def _gather_reasons(world: World, reason: str) -> list[str]:
+    """Collects from all processes the reason why one cannot take part; an empty reason means that it can."""
     import torch.distributed as dist
 
     reasons: list[Any] = [None] * world.size
@@ -353,8 +391,8 @@ def _gather(world: World, reason: str) -> list[str]:
     return [each for each in reasons if each]
 
 
-def _do(team: _Team) -> None:
-    """What the first process does next; it ends in all of them, or in none."""
+def _do_work(team: _Team) -> None:
+    """Receives a training or test and runs it, unless one of the processes cannot take part."""
     import torch.distributed as dist
 
     from rcnn_odom.training.saving import Stopped, TimeUp
@@ -366,23 +404,23 @@ def _do(team: _Team) -> None:
     try:
         trainer = _prepare(work)
     except (InputError, OSError) as error:
-        reason = f"{_name(team.world)}: {error}"
-    if _gather(team.world, reason):
+        reason = f"{_describe_process(team.world)}: {error}"
+    if _gather_reasons(team.world, reason):
         return
-    with suppress(Stopped, TimeUp):  # agreed on by all
+    with suppress(Stopped, TimeUp):  # All processes stop together.
         getattr(trainer, work.name)(work.module, datamodule=work.datamodule, **work.options)
 
 
 def _prepare(work: Work) -> "L.Trainer":
-    """The Trainer of this process, its data loaded.
+    """Builds the Trainer of this process and loads its data.
 
     Raises:
-        InputError: the files are not those of the first process, or a device is missing.
+        InputError: the folders or recordings differ from those of the first process, or a device is missing.
     """
     import lightning as L
 
     for mark in work.marks:
-        if not _wait_until(mark.exists, SEEN_WITHIN):
+        if not _wait_until(mark.exists, FILE_TIMEOUT):
             raise InputError(
                 f"{mark.parent}: is not the first process' folder; start all processes in the same folder, "
                 "with outputs and run_dir on a file system that all nodes share"

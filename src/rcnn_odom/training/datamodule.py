@@ -1,4 +1,4 @@
-"""The one DataModule that every model shares: windows of pairs to train on, whole drives to score."""
+"""The DataModule of all models: windows of pairs for training, whole drives for validation and test."""
 
 import logging
 import os
@@ -24,11 +24,11 @@ from rcnn_odom.training.windows import Batches, FreshSampler, TrainingLoader, Wi
 log = logging.getLogger(__name__)
 
 SAMPLED_FRAMES = 50
-"""Frames of a recording without a return that are looked at to say why."""
+"""Number of frames that are examined to explain why a recording has no return."""
 
 
 class WholeDrives(Dataset):
-    """Whole drives in order, each one item: its ``name`` and ``scans`` (N, bins) in metres."""
+    """A dataset whose items are whole drives: ``name``, and ``scans`` (N, bins) in metres."""
 
     def __init__(self, drives: list[Drive]) -> None:
         self.drives = drives
@@ -42,26 +42,32 @@ class WholeDrives(Dataset):
 
 
 class OdometryDataModule(L.LightningDataModule):
-    """Recordings, encoded once, for every model.
+    """Opens and encodes recordings, and gives training windows and whole drives.
 
     Args:
-        open_recording: name -> recording.
-        train, val, test: names of recordings; ``NAME[0.85:]`` takes a part of one, as fractions of it,
-            ``NAME[::3]`` every third scan.
-        sensor: what the depth vectors are like.
-        window: pairs in a training window; 1 for the CNNs. batch_size: windows in a batch.
-        stride: frames between the beginnings of windows; None: the window's length.
-        repeat: how often each window comes in an epoch.
-        cache_dir: where encoded scans are kept. workers: processes that encode; None for all cores.
-        seed: of the order and the augmentation.
-        fresh_epochs: of a training on new worlds in every epoch, where ``open_recording`` makes a drive for
-            any name: see :class:`rcnn_odom.training.fresh_worlds.FreshWorlds`. 0: every epoch sees the same
-            drives.
-        worlds_dir: of those worlds, removed after use; None: they stay in ``cache_dir``, for other trainings.
-        augment: options of :class:`rcnn_odom.training.augmentation.Augmentation`, of the training windows.
+        open_recording: function from a name to the recording.
+        train, val, test: names of recordings. ``NAME[0.85:]`` is a part of a recording, in fractions of it;
+            ``NAME[::3]`` is every third scan.
+        sensor: the sensor of the depth vectors.
+        cache_dir: folder of the encoded scans.
+        window: pairs in a training window; 1 for the CNNs.
+        batch_size: windows in a batch.
+        stride: frames between the beginnings of windows; None: the length of a window.
+        repeat: how often each window is drawn in an epoch.
+        workers: number of processes that encode scans; None: one for each core.
+        seed: seed of the order of the windows and of the augmentation.
+        fresh_epochs: number of epochs of a training with new simulated drives in every epoch; then
+            ``open_recording`` must accept any name, see :class:`rcnn_odom.training.fresh_worlds.FreshWorlds`.
+            0: all epochs have the same drives.
+        worlds_dir: folder of the new drives, which are removed after use; None: they stay in ``cache_dir``
+            for other trainings.
+        augment: options of :class:`rcnn_odom.training.augmentation.Augmentation` for the training windows.
 
     Attributes:
-        fresh_first: where the numbers of the new worlds begin: after those of the stage before.
+        drives: the loaded drives by split.
+        fresh_first: number of the first new world; a second stage continues after the worlds of the first.
+        worlds: the new worlds of the present training; None without them.
+        windows: the windows of the present training.
     """
 
     def __init__(
@@ -101,14 +107,17 @@ class OdometryDataModule(L.LightningDataModule):
         """Opens and encodes the drives of these splits.
 
         Args:
-            splits: of ``train``, ``val`` and ``test``.
-            encode: False for models that look at whole scans: the drives have no depth vectors, and their
-                beams are not compared with the sensor.
+            splits: some of ``train``, ``val`` and ``test``.
+            encode: False for models that use whole scans: the drives get no depth vectors, and their beams
+                are not compared with the sensor.
+
+        Returns:
+            This DataModule.
 
         Raises:
-            InputError: a split is empty; a recording is missing, damaged, of another laser than the sensor,
-                without a return or shorter than a window; new worlds are wanted in place of a part of a
-                drive.
+            InputError: a split is empty; a recording is missing or damaged, was taken by a laser other than
+                the sensor, has no return or is shorter than a window; or a part of a simulated drive is
+                named while new worlds are made in every epoch.
         """
         for split in splits:
             if not self.names[split]:
@@ -133,14 +142,14 @@ class OdometryDataModule(L.LightningDataModule):
         return self
 
     def _encode(self, recordings: list[Recording]) -> list[Drive]:
-        """The recordings with their depth vectors, each with a return at least."""
+        """Encodes recordings; refuses one in which no scan has a return."""
         drives = encode_recordings(recordings, self.sensor, self.cache_dir, self.workers)
         for recording, drive in zip(recordings, drives, strict=True):
             self._check_returns(recording, drive)
         return drives
 
     def _check_parts(self, recordings: dict[str, Recording]) -> None:
-        """Refuses parts of training drives that are made anew in every epoch."""
+        """Refuses a part of a training drive if the drive is simulated anew in every epoch."""
         for name in self.names["train"] if self.fresh_epochs else []:
             whole = parse_part(name).file
             if whole != name and not recordings[whole].keeps_world:
@@ -150,7 +159,7 @@ class OdometryDataModule(L.LightningDataModule):
                 )
 
     def _check_returns(self, recording: Recording, drive: Drive) -> None:
-        """Refuses a recording in which nothing is seen; tells how many of its scans have no return."""
+        """Refuses a recording without any return; warns of scans without a return."""
         empty = np.flatnonzero(~drive.scans.any(1))
         if 0 < len(empty) < len(drive):
             log.warning(
@@ -167,6 +176,7 @@ class OdometryDataModule(L.LightningDataModule):
         )
 
     def _check_windows(self) -> None:
+        """Refuses training drives that are shorter than a window."""
         for drive in self.drives.get("train", []):
             if len(drive) <= self.window:
                 raise InputError(
@@ -175,7 +185,7 @@ class OdometryDataModule(L.LightningDataModule):
                 )
 
     def setup(self, stage: str | None = None) -> None:
-        """Lightning's hook: the same as :meth:`load`, once."""
+        """Lightning's hook: calls :meth:`load` unless the drives are loaded."""
         if not self.drives:
             self.load()
 
@@ -187,7 +197,7 @@ class OdometryDataModule(L.LightningDataModule):
         """Shuffled batches of windows: see :class:`rcnn_odom.training.windows.Windows`."""
         drives = self.drives["train"]
         self.windows = Windows(drives, self.sensor, self.window, self.augmentation)
-        sampler, (rank, processes) = self._sampler(), self._place()
+        sampler, (rank, processes) = self._sampler(), self._rank_and_size()
         if self.fresh_epochs:
             self.close()
             self.worlds = FreshWorlds(
@@ -200,30 +210,30 @@ class OdometryDataModule(L.LightningDataModule):
                 keep=self.worlds_dir is None,
                 first=self.fresh_first,
             )
-            sampler = FreshSampler(self.windows, self.worlds, *self._sampling())
-        # A batch is gathered in one call, so there is nothing to collate; worker processes would only
-        # copy what a memory map gives for nothing.
+            sampler = FreshSampler(self.windows, self.worlds, *self._sampler_options())
+        # A batch is built in one call, so there is nothing to collate. Worker processes would only add
+        # copies, since scans are memory-mapped.
         return TrainingLoader(
             self.windows,
             batch_sampler=Batches(sampler, self._windows_in_batch(), rank, processes),  # type: ignore[arg-type]
-            collate_fn=_as_is,
+            collate_fn=_return_unchanged,
         )
 
     def _sampler(self) -> WindowSampler:
         lengths = [len(drive) for drive in self.drives["train"]]
-        return WindowSampler(lengths, self.window, *self._sampling())
+        return WindowSampler(lengths, self.window, *self._sampler_options())
 
-    def _sampling(self) -> tuple[bool, int, int | None, int]:
+    def _sampler_options(self) -> tuple[bool, int, int | None, int]:
         return self.augmentation.mirror, self.seed, self.stride, self.repeat
 
     @property
     def batches_per_epoch(self) -> int:
-        """Steps that an epoch takes."""
+        """Number of training steps in an epoch."""
         return len(self._sampler()) // self._windows_in_batch()
 
     def _windows_in_batch(self) -> int:
-        """Of all processes together: as many as wanted, or as many as there are, shared evenly."""
-        windows, (_, processes) = len(self._sampler()), self._place()
+        """Windows in a batch of all processes: ``batch_size``, or fewer if an epoch has fewer windows."""
+        windows, (_, processes) = len(self._sampler()), self._rank_and_size()
         if windows < processes:
             raise InputError(
                 f"the training drives have {windows} windows of {self.window} pairs, fewer than the "
@@ -231,16 +241,16 @@ class OdometryDataModule(L.LightningDataModule):
             )
         return min(self.batch_size, windows // processes * processes)
 
-    def _place(self) -> tuple[int, int]:
-        """Number of this process among those that train, and how many these are."""
+    def _rank_and_size(self) -> tuple[int, int]:
+        """The rank of this process and the number of processes that train."""
         return (self.trainer.global_rank, self.trainer.world_size) if self.trainer else (0, 1)
 
     def __getstate__(self) -> dict[str, Any]:
-        """What a process that trains needs: it finds the scans in the cache, instead of being sent them."""
+        """The state for another process, which reads the scans from the cache."""
         return self.__dict__ | {"drives": {}, "worlds": None, "windows": None}
 
     def close(self) -> None:
-        """Ends what is being made of new worlds."""
+        """Stops making new worlds."""
         if self.worlds is not None:
             self.worlds.close()
 
@@ -253,20 +263,21 @@ class OdometryDataModule(L.LightningDataModule):
         self.close()
 
     def val_dataloader(self) -> DataLoader:
-        """Whole validation drives, one an item; several processes share them."""
+        """Whole validation drives, one per item; several processes share them."""
         return self._whole_drives("val")
 
     def test_dataloader(self) -> DataLoader:
-        """Whole test drives, one an item; several processes share them."""
+        """Whole test drives, one per item; several processes share them."""
         return self._whole_drives("test")
 
     def _whole_drives(self, split: str) -> DataLoader:
         drives = WholeDrives(self.drives[split])
-        rank, processes = self._place()
-        # Some come twice where they do not come out even, so that no process waits for one that has none.
+        rank, processes = self._rank_and_size()
+        # If the number of drives is not a multiple of the number of processes, some drives are estimated
+        # twice, so that all processes have the same number of items.
         sampler: Sampler[int] = DistributedSampler(drives, processes, rank, shuffle=False)
         return DataLoader(drives, sampler=sampler, batch_size=None)
 
 
-def _as_is(batch: Any) -> Any:
+def _return_unchanged(batch: Any) -> Any:
     return batch

@@ -1,4 +1,4 @@
-"""The steps of ``rcnn-odom export``: calibrate, convert, compare, score, write. A checkpoint is only read."""
+"""The steps of ``rcnn-odom export``: calibrate, convert, compare, score and write."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -20,14 +20,14 @@ from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training.checkpoint import load_module
-from rcnn_odom.training.onnx_graph import check, to_onnx, write, write_metadata
+from rcnn_odom.training.onnx_graph import compare_with_model, to_onnx, write, write_metadata
 from rcnn_odom.training.stages import build_datamodule
 
 if TYPE_CHECKING:
     import onnx
 
-ALLOWED = 0.001
-"""Drift, as a ratio, that a precision may cost."""
+MAX_ADDED_DRIFT = 0.001
+"""Largest drift, as a ratio, that the exported file may add to that of the checkpoint."""
 
 
 def export_checkpoint(
@@ -36,22 +36,22 @@ def export_checkpoint(
     """Writes an ONNX file of a run's checkpoint and prints the drift of each precision.
 
     Args:
-        checkpoint: to export.
-        run: the folder with its configuration, by which the test sequences are read.
+        checkpoint: the checkpoint to export; it is not changed.
+        run: folder of the run, whose configuration names the test sequences.
         out: the file to write.
         precision: ``fp32`` or ``int8``.
-        fit_on: drives to fit the uncertainty on anew. None: as it is; where it has not been fitted yet, as
-            in a training that was stopped, on the validation sequences. The checkpoint keeps its own.
+        fit_on: drives to fit the uncertainty on. None: the uncertainty of the checkpoint is used; if it has
+            none, as in a stopped training, it is fitted on the validation sequences.
 
     Raises:
-        InputError: no such checkpoint, no configuration of a run, recordings that are not to be had, drives
-            to fit on that were trained or are tested on, a graph that does not do what the checkpoint
-            does or costs too much drift.
+        InputError: there is no such checkpoint or configuration; recordings are missing; the network was
+            trained or is tested on a drive of ``fit_on``; the graph differs from the checkpoint or has too
+            much more drift.
     """
     model, settings = load_module(checkpoint).model, read_settings(run)
     data = settings["data"]
     if fit_on:
-        _need_unseen(fit_on, data)
+        _refuse_used_drives(fit_on, data)
         data["val"] = fit_on
     fit = bool(fit_on) or not model.calibrated
     datamodule = build_datamodule(settings).load(("val", "test") if fit else ("test",))
@@ -66,7 +66,7 @@ def export_checkpoint(
     known = {name: report for name, report in covered.items() if report is not None}
     if known:
         print(f"\n{coverage_table(known)}\n", flush=True)
-    _need_little_cost(reports, precision)
+    _check_added_drift(reports, precision)
     report = reports[f"onnx {precision}"]
     each = {name: one["drift"]["t_err"] for name, one in report["sequences"].items()}
     drift = {"data": data["name"], "mean": report["drift"], "sequences": each}  # ratios
@@ -75,47 +75,57 @@ def export_checkpoint(
 
 
 def export_unscored(checkpoint: Path, out: Path, precision: str) -> None:
-    """Writes an ONNX file without any recording: compared with the checkpoint on random scans alone.
+    """Writes an ONNX file without recordings; it is compared with the checkpoint on random scans only.
+
+    Args:
+        checkpoint: the checkpoint to export.
+        out: the file to write.
+        precision: ``fp32`` or ``int8``.
 
     Raises:
-        InputError: no such checkpoint, or a graph that does not do what it does.
+        InputError: there is no such checkpoint, or the graph differs from it.
     """
     _, graphs = _convert(load_module(checkpoint).model, [precision])
     _write(graphs[precision], out, checkpoint)
 
 
 def load_odometer(checkpoint: str | Path, threads: int = 1) -> Odometer:
-    """A checkpoint's network for a stream, exported in memory.
+    """Builds an odometer with the network of a checkpoint, which is exported in memory.
+
+    Args:
+        checkpoint: a ``.ckpt`` file of a run.
+        threads: number of threads of the network.
 
     Raises:
-        InputError: no such checkpoint.
+        InputError: there is no such checkpoint.
     """
     graph = to_onnx(load_module(checkpoint).model, "fp32")
     return Odometer(PairTracker(OnnxStepper(graph.SerializeToString(), threads)))
 
 
-def _need_unseen(names: list[str], data: Settings) -> None:
-    """Compares whole recordings: a training on NAME also sees its new worlds, ``NAME~1`` and so on."""
+def _refuse_used_drives(names: list[str], data: Settings) -> None:
+    """Refuses drives of the training or test. Training on NAME includes its new worlds, ``NAME~1`` etc."""
     used, wanted = (
         {parse_part(name).file.split("~")[0] for name in each}
         for each in (data["train"] + data["test"], names)
     )
-    if seen := sorted(used & wanted):
-        raise InputError(f"--fit-on: {', '.join(seen)} was trained or is tested on; name other drives")
+    if used_drives := sorted(used & wanted):
+        raise InputError(f"--fit-on: {', '.join(used_drives)} was trained or is tested on; name other drives")
 
 
 def _convert(
     model: TrainedModel, precisions: Iterable[str]
 ) -> tuple[dict[str, OnnxStepper], dict[str, "onnx.ModelProto"]]:
-    """Graphs, compared with their model, by precision; ready to step, and to be written."""
+    """Converts a model to graphs and compares them with it; returns steppers and graphs by precision."""
     graphs = {precision: to_onnx(model, precision) for precision in precisions}
     steppers = {each: OnnxStepper(graph.SerializeToString()) for each, graph in graphs.items()}
     for stepper in steppers.values():
-        check(stepper, model)
+        compare_with_model(stepper, model)
     return steppers, graphs
 
 
 def _write(graph: "onnx.ModelProto", out: Path, checkpoint: Path) -> None:
+    """Writes a graph and prints its size."""
     write(graph, out)
     size = out.stat().st_size / 1e6
     print(f"{out}: {size:.1f} MB, its steps compared with those of {checkpoint}")
@@ -124,7 +134,7 @@ def _write(graph: "onnx.ModelProto", out: Path, checkpoint: Path) -> None:
 def _score(
     offline: dict[str, Steps], steppers: dict[str, OnnxStepper], drives: list[Drive], data: Settings
 ) -> dict[str, Report]:
-    """Scores of the checkpoint and of each precision, see :func:`rcnn_odom.evaluation.scores.score_all`."""
+    """Scores the checkpoint and each precision, see :func:`rcnn_odom.evaluation.scores.score_all`."""
     estimates = {"checkpoint": offline}
     for precision, stepper in steppers.items():
         estimates[f"onnx {precision}"] = {drive.name: stream_steps(stepper, drive) for drive in drives}
@@ -135,20 +145,21 @@ def _score(
 
 
 def stream_steps(stepper: Stepper, drive: Drive) -> Steps:
-    """The steps of a drive, one pair of scans after the other."""
+    """Estimates the steps of a drive, one pair of scans after the other."""
     stepper = as_used(stepper)
     stepper.reset()
     frames = tqdm(range(len(drive) - 1), desc=drive.name, unit="scan", disable=None, leave=False)
     return estimate_pairs(stepper, (np.array(drive.scans[frame : frame + 2]) for frame in frames))
 
 
-def _need_little_cost(reports: dict[str, Report], precision: str) -> None:
-    exact, mine = reports["checkpoint"]["drift"], reports[f"onnx {precision}"]["drift"]
+def _check_added_drift(reports: dict[str, Report], precision: str) -> None:
+    """Refuses a precision with too much more drift than the checkpoint."""
+    exact, exported = reports["checkpoint"]["drift"], reports[f"onnx {precision}"]["drift"]
     if exact is None:
-        raise InputError("no test sequence has a segment, so that drift says nothing; use --no-drift")
-    if not mine - exact <= ALLOWED:  # nan is no low cost either
+        raise InputError("no test sequence has a segment, so there is no drift to compare; use --no-drift")
+    if not exported - exact <= MAX_ADDED_DRIFT:  # Also refuses nan.
         advice = "train longer" if precision == "fp32" else "leave out --quantize"
         raise InputError(
-            f"{precision} costs {100 * (mine - exact):.2f} percentage points of drift, more than "
-            f"{100 * ALLOWED:g}, and is not written; {advice}"
+            f"{precision} adds {100 * (exported - exact):.2f} percentage points of drift, more than "
+            f"{100 * MAX_ADDED_DRIFT:g}, and is not written; {advice}"
         )

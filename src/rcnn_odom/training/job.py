@@ -1,4 +1,4 @@
-"""What stands around a Hydra job: its folder, and mistakes of the user as one line and an exit status."""
+"""Runs a Hydra job: chooses its folder, and reports mistakes of the user as one line and an exit status."""
 
 import errno
 import logging
@@ -22,35 +22,35 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import ERROR
 from rcnn_odom.terminal import show_any_text
 from rcnn_odom.training import cluster
-from rcnn_odom.training.overrides import explain, is_path, read_paths, written
+from rcnn_odom.training.overrides import explain_override, is_path, read_paths, written
 from rcnn_odom.training.run_state import find_stopped
 from rcnn_odom.training.settings import RENAMED, plain
 from rcnn_odom.training.sweep import folder_name
-from rcnn_odom.training.trainer_options import refusal
+from rcnn_odom.training.trainer_options import explain_refusal
 
 log = logging.getLogger(__name__)
 
 Result = TypeVar("Result")
 
 NO_JOB_SUCCEEDED = "No trials are completed yet."
-"""What Optuna says at the end of a sweep whose jobs have all failed."""
-HYDRAS_OWN = ("Config group override", "Only one of --run")
-"""How those of Hydra's complaints begin that are plain ValueErrors: ``model=null``, ``-m`` with ``--cfg``."""
+"""Optuna's message at the end of a sweep in which all jobs have failed."""
+HYDRA_VALUE_ERRORS = ("Config group override", "Only one of --run")
+"""Beginnings of messages of Hydra's ValueErrors, for ``model=null`` and for ``-m`` with ``--cfg``."""
 
 _failed: list[Exception] = []
 
 
 def run_folder(new: str, *, _root_: DictConfig) -> str:
-    """The folder of a run that was stopped and has the very same settings, else a new one.
+    """The folder of a stopped run with exactly the same settings; otherwise a new folder.
 
     Args:
-        new: the folder for a new run; older ones are looked for beside it.
-        _root_: the whole configuration, which OmegaConf gives.
+        new: the folder for a new run; stopped runs are searched for beside it.
+        _root_: the whole configuration; passed by OmegaConf.
     """
     chosen = [str(key) for key in _root_ if key not in ("hydra", "run_dir")]
     try:
         settings = plain(OmegaConf.masked_copy(_root_, chosen))
-    except (InputError, OmegaConfBaseException):  # will be logged when the run begins
+    except (InputError, OmegaConfBaseException):  # The run reports the error later.
         return new
     return str(find_stopped(Path(new).parent, settings) or new)
 
@@ -61,45 +61,50 @@ OmegaConf.register_new_resolver("folder_name", folder_name, replace=True)
 
 
 def in_sweep() -> bool:
-    """Whether the present job is one of a multirun."""
+    """Whether the present job belongs to a multirun."""
     return not OmegaConf.is_missing(HydraConfig.get().job, "num")
 
 
 def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | None:
-    """The job's result in the folder that Hydra gave it; None after a mistake, which has been told.
+    """Runs a job in the folder that Hydra has created, and logs a mistake of the user.
 
-    The mistake is remembered for :func:`run_command`. In a sweep it is also written to ``error.txt`` in the
-    job's folder, and raised: Hydra goes on with the other jobs and raises it again at the end.
+    The mistake is saved for :func:`run_command`. In a sweep it is also written to ``error.txt`` in the job's
+    folder and raised: Hydra continues with the other jobs and raises it again at the end.
+
+    Returns:
+        The result of the job; None after a mistake.
 
     Raises:
-        KeyboardInterrupt: stopped, which also stops a sweep.
+        KeyboardInterrupt: the job was stopped, which also stops a sweep.
         InputError, OSError: a mistake in a sweep.
     """
     folder, here = Path(HydraConfig.get().runtime.output_dir), Path.cwd()
     try:
         if HydraConfig.get().job.chdir:
             raise InputError(
-                "hydra.job.chdir=true: paths are relative to where the command was started; leave it out"
+                "hydra.job.chdir=true: paths must be relative to the folder of the command; leave it out"
             )
         if in_sweep():
             cluster.refuse_sweep(cluster.find_world())
             if any(override.split("=")[0] == "run_dir" for override in HydraConfig.get().overrides.task):
-                raise InputError("run_dir= is one run's; the folder of a sweep is set by hydra.sweep.dir=")
+                raise InputError(
+                    "run_dir= is the folder of a single run; set the folder of a sweep by hydra.sweep.dir="
+                )
             (folder / ERROR).unlink(missing_ok=True)
         elif "sweeps" in HydraConfig.get().runtime.choices:
-            raise InputError("+sweeps= needs -m: one run would take nothing from a sweep")
+            raise InputError("+sweeps= needs -m: it has no effect on a single run")
         cfg.run_dir = str(folder.relative_to(here) if folder.is_relative_to(here) else folder)
         return job(cfg)
-    except SystemExit:  # how Lightning ends after Ctrl-C
+    except SystemExit:  # Lightning raises it after Ctrl-C.
         raise KeyboardInterrupt from None
     except Exception as error:
         is_users = isinstance(error, InputError | OSError)
         if is_users:
             is_full = getattr(error, "errno", None) in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-            log.error("error: %s%s", error, "; make room, and the same command goes on" if is_full else "")
+            log.error("error: %s%s", error, "; make room, then repeat the command" if is_full else "")
             _failed.append(error)
         if in_sweep():
-            with suppress(OSError):  # the error itself may be that nothing can be written
+            with suppress(OSError):  # The error may be that the disk is full.
                 (folder / ERROR).write_text(_one_line(f"{type(error).__name__}: {error}") + "\n", "utf-8")
         if in_sweep() or not is_users:
             raise
@@ -107,11 +112,11 @@ def run_job(job: Callable[[DictConfig], Result], cfg: DictConfig) -> Result | No
 
 
 def run_command(main: Callable[[], object]) -> int:
-    """Runs a function decorated with ``hydra.main``; the exit status: 1 after a mistake of the user."""
-    # Hydra would print and exit by itself, also where a folder cannot be made.
+    """Runs a function decorated with ``hydra.main``; the exit status is 1 after a mistake of the user."""
+    # Otherwise Hydra prints an error and exits, also if it cannot create a folder.
     os.environ.setdefault("HYDRA_FULL_ERROR", "1")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # ends like Ctrl-C
-    logging.raiseExceptions = False  # a log on a full disk would otherwise print a traceback for every line
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # SIGTERM acts like Ctrl-C.
+    logging.raiseExceptions = False  # Otherwise logging prints a traceback per line if the disk is full.
     show_any_text()
     try:
         sys.argv[1:] = read_paths(sys.argv[1:])
@@ -119,7 +124,7 @@ def run_command(main: Callable[[], object]) -> int:
         if world is None or world.size == 1:
             return _run(main)
         if {"-m", "--multirun"} & set(sys.argv[1:]):
-            if world.rank > 0:  # the first process says why
+            if world.rank > 0:  # The first process reports the error.
                 return 1
             cluster.refuse_sweep(world)
         return cluster.run_in(world, partial(_run, main))
@@ -131,35 +136,36 @@ def run_command(main: Callable[[], object]) -> int:
 
 
 def _run(main: Callable[[], object]) -> int:
-    """What :func:`run_command` gives, in the process that the command is run in."""
+    """Runs the function in this process; returns the exit status."""
     try:
         main()
     except KeyboardInterrupt:
         return 130
-    except InputError:  # of a sweep's job, which has told
+    except InputError:  # A job of a sweep has logged it.
         return 1
     except (HydraException, OmegaConfBaseException, OSError, yaml.YAMLError) as error:
         print(f"error: {_explain(error)}", file=sys.stderr)
         return 1
     except ValueError as error:
-        told = str(error).startswith(HYDRAS_OWN) or (_failed and str(error) == NO_JOB_SUCCEEDED)
-        if not told:
+        is_users = str(error).startswith(HYDRA_VALUE_ERRORS) or (_failed and str(error) == NO_JOB_SUCCEEDED)
+        if not is_users:
             raise
-        # Why each job failed is already logged.
+        # The error of each failed job is already logged.
         print(f"error: {_one_line(str(error))}", file=sys.stderr)
         return 1
     return 1 if _failed else 0
 
 
 def _one_line(text: str) -> str:
+    """The text with every line break and run of spaces replaced by one space."""
     return " ".join(text.split())
 
 
 def _explain(error: Exception) -> str:
-    """One line on what Hydra or the system did not accept: what is wrong, and what to do."""
+    """Explains an error of Hydra or of the system in one line: what is wrong, and what to do."""
     if isinstance(error, OverrideParseException):
-        return explain(error.override)
-    # What follows is Hydra's own place in the configuration, not the user's mistake.
+        return explain_override(error.override)
+    # The rest of the message is a place in Hydra's configuration, of no use to the user.
     message = _one_line(re.split(r"\s+(?:full_key:|Config search path:)", str(error))[0])
     for before, now in RENAMED.items():
         if f"'{before}" in message:
@@ -173,23 +179,25 @@ def _explain(error: Exception) -> str:
         return _explain_name(found[1])
     if found := re.match(r"Ambiguous value for argument '(.*?)=(.*?)' 1\.", message):
         return _explain_commas(*found.groups())
-    # An error of Hydra may be one of the system's too.
+    # Some errors of Hydra are OSErrors too.
     is_folder = isinstance(error, OSError) and not isinstance(error, HydraException)
     return message + ("; choose another outputs= or run_dir=" if is_folder else "")
 
 
 def _explain_name(name: str) -> str:
-    """On an option that is not in the configuration."""
+    """Explains an option that is not in the configuration."""
     if name.startswith("trainer."):
-        return refusal(name.removeprefix("trainer.")) or f"{name}: is not set yet; write +{name}=..."
-    return f"{name}: there is no such option; --help shows those that there are"
+        return (
+            explain_refusal(name.removeprefix("trainer."))
+            or f"{name}: is not in the configuration; write +{name}=..."
+        )
+    return f"{name}: there is no such option; --help shows all options"
 
 
 def _explain_commas(name: str, value: str) -> str:
+    """Explains a comma in a value without ``-m``."""
     if is_path(name):
         return (
             f"{name}={value}: Hydra cannot read ',' in a value without quotes; write {written(name, value)}"
         )
-    return (
-        f"{name}={value}: several values; write '{name}=[{value}]' for a list, or add -m to run each of them"
-    )
+    return f"{name}={value}: several values; write '{name}=[{value}]' for a list, or add -m for separate runs"

@@ -1,4 +1,4 @@
-"""``data.reference=matcher``: the path of scan matching as the truth, kept beside encoded scans."""
+"""``data.reference=matcher``: scan matching gives the ground truth, which is cached beside encoded scans."""
 
 import hashlib
 import json
@@ -29,15 +29,15 @@ SOURCES = (
     *("geometry.py", "matching/*.py", "models/matcher.py", "models/prior.py", "models/tracking.py"),
     "recordings/clock.py",
 )
-"""That decide what scan matching gives."""
+"""Sources that determine the result of scan matching; a change invalidates cached paths."""
 
 
 class MatchedPath(NamedTuple):
-    """What scan matching says of a recording.
+    """The path of a recording by scan matching.
 
     Attributes:
-        steps: (N-1, 3) metres and radians.
-        marks: (N,) kinds of what the step to a scan suffers from; empty where nothing.
+        steps: (N-1, 3) steps between consecutive scans, metres and radians.
+        marks: (N,) kinds of problems of the step to each scan, such as ``held``; empty if there is none.
     """
 
     steps: FloatArray
@@ -45,25 +45,25 @@ class MatchedPath(NamedTuple):
 
 
 class MatcherTruth:
-    """Opens recordings, those without poses with the path of scan matching as theirs.
+    """Opens recordings; those without poses get the poses of scan matching.
 
-    A step that the matcher marks (held, no match, poor match, ...) is not to be learned from: the recording's
-    ``trusted`` says so.
+    Steps that the matcher marks (held, no match, poor match, ...) are not used for training: they are False
+    in ``trusted`` of the recording.
 
     Args:
-        open_recording: name -> recording, whose poses are nan where they are to be found.
-        folder: where paths are kept.
-        deskew: ``data.deskew``.
+        open_recording: function from a name to the recording; poses that scan matching should find are nan.
+        folder: folder of the cached paths.
+        deskew: the option ``data.deskew``.
     """
 
     def __init__(self, open_recording: OpenRecording, folder: Path, deskew: str) -> None:
         self.open_recording, self.folder, self.deskew = open_recording, folder, deskew
 
     def __call__(self, name: str) -> Recording:
-        """The recording of this name; of another source, which has poses, as it is.
+        """Opens a recording. One that has poses is returned unchanged.
 
         Raises:
-            InputError: it cannot be opened, or the folder cannot be written.
+            InputError: the recording cannot be opened, or the folder cannot be written.
         """
         recording = self.open_recording(name)
         if not np.isnan(recording.poses).all():
@@ -82,13 +82,13 @@ class MatcherTruth:
         )
 
     def _find(self, recording: Recording) -> MatchedPath:
-        """The path from the folder, or computed into it."""
+        """Reads the path from the cache, or computes and caches it."""
         deskew = wants_deskew(self.deskew, recording.is_compensated)
         path = self.folder / f"{file_name(recording.name)}-{_key(recording, deskew)}.npz"
         found = _read(path, len(recording))
         if found is None:
             try:
-                # Another process may be faster.
+                # Another process may compute the same path meanwhile.
                 with one_at_a_time(self.folder, "matching", "matching scans"):
                     found = _read(path, len(recording)) or match(recording, deskew)
                     if not path.exists():
@@ -99,11 +99,11 @@ class MatcherTruth:
 
 
 def match(recording: Recording, deskew: bool) -> MatchedPath:
-    """The path of a recording, as ``rcnn-odom run`` finds it.
+    """Matches the scans of a recording, as ``rcnn-odom run`` does.
 
     Args:
-        recording: N scans.
-        deskew: scans whose beams have times are undistorted.
+        recording: a recording of N scans.
+        deskew: whether scans whose beams have times are undistorted.
     """
     tracking = Tracking(MatcherTracker(deskew=deskew))
     steps, marks = [], []
@@ -119,28 +119,29 @@ def match(recording: Recording, deskew: bool) -> MatchedPath:
 
 
 def _key(recording: Recording, deskew: bool) -> str:
-    """Hash of all that changes a recording's path."""
+    """Hash of everything that determines a recording's path."""
     sources = sorted(path for pattern in SOURCES for path in PACKAGE.glob(pattern))
     parts = [recording.fingerprint, len(recording), recording.has_clock, deskew, hash_statements(sources)]
     return hashlib.sha256(json.dumps(parts).encode()).hexdigest()[:16]
 
 
-def _is_whole(found: MatchedPath, scans: int) -> bool:
+def _is_valid(found: MatchedPath, scans: int) -> bool:
+    """Whether a cached path has the right shapes and types, and finite steps."""
     fits = found.steps.shape == (scans - 1, 3) and found.marks.shape == (scans,)
     return fits and found.marks.dtype.kind == "U" and bool(np.isfinite(found.steps).all())
 
 
 def _read(path: Path, scans: int) -> MatchedPath | None:
-    """A path that is kept; None where it is not there, or damaged."""
+    """Reads a cached path; None if there is none or it is damaged."""
     try:
-        with np.load(path, allow_pickle=False) as kept:
-            found = MatchedPath(kept["steps"], kept["marks"])
+        with np.load(path, allow_pickle=False) as cached:
+            found = MatchedPath(cached["steps"], cached["marks"])
     except FileNotFoundError:
         return None
-    except Exception:  # whatever a damaged file leads to
+    except Exception:  # A damaged file can raise any error.
         found = None
-    if found and _is_whole(found, scans):
+    if found and _is_valid(found, scans):
         return found
-    log.warning("%s: damaged, matching its scans again", path)
+    log.warning("%s: the file is damaged, matching the scans again", path)
     path.unlink(missing_ok=True)
     return None

@@ -1,4 +1,4 @@
-"""Models as LightningModules: one class trains any model, the four of the paper have names of their own."""
+"""LightningModules: one class trains any model; the four networks of the paper have subclasses."""
 
 import pickle
 from collections.abc import Callable
@@ -25,20 +25,21 @@ from rcnn_odom.training.machine import keep_freed_memory
 
 
 class OdometryModule(L.LightningModule):
-    """Trains any model: training step, drives estimated in order, optimiser, logging.
+    """Trains, validates and tests any model.
 
     Args:
-        variant: name of a model that trains.
-        options: those of ``conf/model``, plain.
-        sensor: of :class:`rcnn_odom.models.encoding.Sensor`, plain.
-        lengths: in metres, of the segments of the validation drift.
+        variant: name of a model that can be trained.
+        options: options of the model as plain values, see ``conf/model``.
+        sensor: fields of :class:`rcnn_odom.models.encoding.Sensor` as plain values.
+        lengths: lengths in metres of the segments of the validation drift.
 
     Attributes:
         model: the model.
-        mean_step: (3,) of the training drives, metres and radians, for the baseline ``mean_motion``.
-        estimates: the steps of the drives that were validated or tested last, by the drives' names.
-        estimates_file: where a test in other processes leaves its estimates.
-        fingerprint, code: of the training, for its checkpoints: see
+        mean_step: (3,) mean step of the training drives, metres and radians, for the baseline
+            ``mean_motion``.
+        estimates: estimated steps of the last validation or test, by the names of the drives.
+        estimates_file: file in which a test in other processes saves its estimates; None: no file.
+        fingerprint, code: fingerprints of the training, which are saved in its checkpoints; see
             :class:`rcnn_odom.training.run_state.Fingerprints`.
     """
 
@@ -58,7 +59,7 @@ class OdometryModule(L.LightningModule):
         self.fingerprint = self.code = ""
 
     def set_units(self, steps: FloatArray) -> None:
-        """Told the training drives' steps (N, 3) before training, in metres and radians."""
+        """Sets the units of the network from the steps (N, 3) of the training drives, metres and radians."""
         self.mean_step.copy_(torch.from_numpy(steps.mean(0)))
         self.model.set_units(steps)
 
@@ -67,33 +68,36 @@ class OdometryModule(L.LightningModule):
         keep_freed_memory()
 
     def teardown(self, stage: str) -> None:
-        """Lightning's hook at the end, in every process: lets go of the others.
+        """Lightning's hook at the end, in every process: closes the connection to the other processes.
 
-        A process that ends while it still holds the connection sometimes aborts. Processes that a cluster has
-        started do not end yet.
+        A process that ends with an open connection sometimes aborts. Processes that were started by torchrun
+        or Slurm keep the connection, since they have more work to do.
         """
         if self.trainer.world_size > 1 and not has_joined() and torch.distributed.is_initialized():
             torch.distributed.barrier()
             torch.distributed.destroy_process_group()
 
     def on_train_batch_start(self, batch: Batch, batch_idx: int) -> None:
-        """Makes dropout a function of the step, so that a training that goes on draws what it would have."""
-        drawn_from = [self._data.seed, self.global_step, self.global_rank]
-        torch.manual_seed(int(np.random.SeedSequence(drawn_from).generate_state(1)[0]))
+        """Seeds dropout by the step, so that a resumed training draws the same random numbers."""
+        entropy = [self._datamodule.seed, self.global_step, self.global_rank]
+        torch.manual_seed(int(np.random.SeedSequence(entropy).generate_state(1)[0]))
 
     def training_step(self, batch: Batch, batch_idx: int) -> dict[str, Tensor]:
-        """The loss of one batch of windows and what the model logs beside it, scalars.
+        """Computes the loss of a batch of windows, and the other scalars that the model logs.
+
+        Returns:
+            ``loss`` and the other scalars by name.
 
         Raises:
             InputError: the loss is nan or inf.
         """
         outputs = self.model.loss(batch)
-        to_blame = outputs.pop("diverged", None)
-        self._trained_on = batch["frames"]
+        diverged = outputs.pop("diverged", None)
+        self._last_frames = batch["frames"]
         if not outputs["loss"].isfinite():
-            if to_blame is not None and to_blame.any():
-                self._trained_on = batch["frames"][to_blame]
-            raise self._diverged("the loss is nan or inf", self.global_step + 1)
+            if diverged is not None and diverged.any():
+                self._last_frames = batch["frames"][diverged]
+            raise self._divergence_error("the loss is nan or inf", self.global_step + 1)
         return outputs
 
     def configure_gradient_clipping(
@@ -102,65 +106,67 @@ class OdometryModule(L.LightningModule):
         gradient_clip_val: float | None = None,
         gradient_clip_algorithm: str | None = None,
     ) -> None:
-        """Clips the gradient's norm.
+        """Clips the norm of the gradient.
 
-        Lightning refuses to with a fused optimiser under mixed precision, because of the loss scaling of
-        fp16, which bf16 does without.
+        Lightning refuses to clip with a fused optimiser and mixed precision, because of the loss scaling of
+        fp16. bf16 needs no loss scaling.
 
         Raises:
-            InputError: the gradient is nan or inf; the weights are still good.
+            InputError: the gradient is nan or inf. The weights have not been changed yet.
         """
         norm = torch.nn.utils.clip_grad_norm_(self.parameters(), gradient_clip_val or float("inf"))
         if not norm.isfinite():
-            raise self._diverged("the gradient is nan or inf", self.global_step + 1)
+            raise self._divergence_error("the gradient is nan or inf", self.global_step + 1)
 
     def check_weights(self) -> None:
-        """Looks for nan and inf before the weights are kept.
+        """Checks the weights before they are saved.
 
         Raises:
-            InputError: there are some.
+            InputError: a weight is nan or inf.
         """
         if not all(parameter.isfinite().all() for parameter in self.parameters()):
-            raise self._diverged("a weight is nan or inf", self.global_step)
+            raise self._divergence_error("a weight is nan or inf", self.global_step)
 
-    def _diverged(self, what: str, step: int) -> InputError:
-        windows = self._data.windows
-        frames = windows.describe(self._trained_on.tolist()) if windows else "unknown"
+    def _divergence_error(self, what: str, step: int) -> InputError:
+        """An error that names the frames of the last batch."""
+        windows = self._datamodule.windows
+        frames = windows.describe(self._last_frames.tolist()) if windows else "unknown"
         return InputError(
             f"training diverged in epoch {self.current_epoch + 1}, step {step}: {what}, after "
             f"frames {frames}; look at these, or set model.learning_rate lower"
         )
 
     @property
-    def _data(self) -> OdometryDataModule:
+    def _datamodule(self) -> OdometryDataModule:
         return self.trainer.datamodule  # type: ignore[attr-defined,no-any-return]
 
     def on_validation_epoch_start(self) -> None:
-        """Forgets the estimates of the epoch or the test before."""
+        """Removes the estimates of the previous validation or test."""
         self.estimates = {}
 
     on_test_epoch_start = on_validation_epoch_start
 
     def validation_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Keeps the estimate of one whole drive.
+        """Estimates one whole drive.
 
         Raises:
-            InputError: training has diverged.
+            InputError: the estimate is nan or inf, since the training has diverged.
         """
         steps = self.model.estimate_scans(batch["scans"])
         if not np.isfinite(steps.values).all():
-            raise self._diverged("validation is estimated as nan or inf", self.global_step)
+            raise self._divergence_error("a validation estimate is nan or inf", self.global_step)
         self.estimates[batch["name"]] = steps
 
     def on_validation_epoch_end(self) -> None:
-        """Logs the drift of each validation drive and their mean, and the other metrics of a training.
+        """Logs the drift of each validation drive, their mean, and the other validation metrics.
 
         Raises:
-            InputError: a weight is nan or inf, behind a ReLU that hides it; it must not become the best.
+            InputError: a weight is nan or inf. A ReLU may hide that in the estimates, and such weights must
+                not become the best ones.
         """
         self.check_weights()
         self._gather_estimates()
-        drives = [drive for drive in self._data.drives["val"] if drive.name in self.estimates]
+        drives = [drive for drive in self._datamodule.drives["val"] if drive.name in self.estimates]
         drift = DriftMetric([drive.name for drive in drives], lengths=self.lengths, planar=True)
         for drive in drives:
             poses = change_frame(self.estimates[drive.name].poses(), drive.camera_from_laser)
@@ -171,81 +177,84 @@ class OdometryModule(L.LightningModule):
             if metric.in_training and metric.name != DRIFT.name:
                 each = [metric.compute(drive, self.estimates[drive.name], self.lengths) for drive in drives]
                 values[metric.name] = metric.over(each, frames)
-        self.log_dict({f"val/{name}": value for name, value in values.items() if value is not None})
+        # TrainingLog writes them to TensorBoard under readable names.
+        named = {f"val/{name}": value for name, value in values.items() if value is not None}
+        self.log_dict(named, logger=False)
 
     def test_step(self, batch: dict[str, Any], batch_idx: int) -> None:
-        """Keeps the estimate of one whole drive; ``rcnn_odom.evaluation.scores`` scores it."""
+        """Estimates one whole drive, for ``rcnn_odom.evaluation.scores``."""
         self.estimates[batch["name"]] = self.model.estimate_scans(batch["scans"])
 
     def on_test_epoch_end(self) -> None:
-        """Every process gets the estimates of all, and one leaves them in ``estimates_file``."""
+        """Collects the estimates of all processes; the first process saves them in ``estimates_file``."""
         self._gather_estimates()
         if self.estimates_file and self.global_rank == 0:
             self.estimates_file.write_bytes(pickle.dumps(self.estimates))
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Signs the checkpoint."""
+        """Adds the fingerprints of the training to the checkpoint."""
         checkpoint |= {"fingerprint": self.fingerprint, "code": self.code}
 
     def _gather_estimates(self) -> None:
-        """Shares estimates among processes; a drive that two of them have counts once."""
+        """Exchanges estimates among processes; a drive that two processes have estimated counts once."""
         if self.trainer.world_size > 1:
             shares: list[Any] = [None] * self.trainer.world_size
             torch.distributed.all_gather_object(shares, self.estimates)
             self.estimates = {name: steps for share in shares for name, steps in share.items()}
 
     def configure_optimizers(self) -> Any:
-        """Adam with a one-cycle rate over the whole training.
+        """Adam with a one-cycle learning rate over the whole training.
 
-        The one-cycle schedule also lets Adam's beta1 fall from 0.95 to 0.85 while the rate rises, and rise
-        again while it falls: ``cycle_momentum``, on by default in PyTorch.
+        The schedule also changes Adam's beta1: from 0.95 down to 0.85 while the rate rises, and back while it
+        falls (``cycle_momentum``, PyTorch's default).
         """
         rate = self.model.options["learning_rate"]
         optimizer = torch.optim.Adam([p for p in self.parameters() if p.requires_grad], lr=rate, fused=True)
-        # Not the trainer's own count, which makes the loader before a checkpoint can tell it where to go on.
+        # Not `trainer.estimated_stepping_batches`, which creates the loader before the checkpoint sets its
+        # position.
         assert self.trainer.max_epochs is not None
-        steps = self.trainer.max_epochs * steps_per_epoch(self.trainer.limit_train_batches, self._data)
+        steps = self.trainer.max_epochs * steps_per_epoch(self.trainer.limit_train_batches, self._datamodule)
         schedule = torch.optim.lr_scheduler.OneCycleLR(optimizer, rate, total_steps=steps)
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
 
 def steps_per_epoch(limit: float | None, data: OdometryDataModule) -> int:
-    """Steps of an epoch that ``trainer.limit_train_batches`` may cut; Lightning's 1.0 cuts nothing."""
+    """Number of steps in an epoch; a whole number as ``trainer.limit_train_batches`` may reduce it."""
     return min(limit, data.batches_per_epoch) if isinstance(limit, int) else data.batches_per_epoch
 
 
 class PaperModule(OdometryModule):
-    """A module that knows which model it trains."""
+    """A module for one model, which the class attribute ``variant`` names."""
 
     def __init__(self, options: Settings, sensor: Settings, lengths: list[float]) -> None:
         super().__init__(self.variant, options, sensor, lengths)
 
 
 class CNNRegression(PaperModule):
-    """Both outputs by eq. 3 from one pair of scans."""
+    """The CNN with regression of distance and rotation (eq. 3) from one pair of scans."""
 
     variant = "cnn_reg"
 
 
 class CNNClassification(PaperModule):
-    """Rotation by eq. 4 from one pair of scans: the first stage of both recurrent variants."""
+    """The CNN with classification of the rotation (eq. 4): the first stage of both recurrent networks."""
 
     variant = "cnn_cls"
 
 
 class RCNNRegression(PaperModule):
-    """Eq. 3 after the LSTM: the paper's best."""
+    """The RCNN with regression (eq. 3), the best network of the paper."""
 
     variant = "rcnn_reg"
 
 
 class RCNNClassification(PaperModule):
-    """Eq. 4 after the LSTM."""
+    """The RCNN with classification of the rotation (eq. 4)."""
 
     variant = "rcnn_cls"
 
 
 def module_for(variant: str) -> Callable[[Settings, Settings, list[float]], OdometryModule]:
-    """What makes the module of a model out of options, sensor and lengths, as :class:`OdometryModule`."""
+    """The class or function that builds the module of a model from its options, sensor and lengths."""
     named = {module.variant: module for module in PaperModule.__subclasses__()}
     return named.get(variant) or partial(OdometryModule, variant)

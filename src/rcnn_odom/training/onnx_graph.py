@@ -1,4 +1,4 @@
-"""A trained model as an ONNX file: one pair of scans in, one step out, the network's state explicit."""
+"""Exports a trained model to ONNX: the graph computes one step from one pair of scans and the state."""
 
 import json
 import logging
@@ -25,15 +25,15 @@ from rcnn_odom.models.trained import TorchStepper, TrainedModel
 if TYPE_CHECKING:
     import onnx
 
-LANES = 16
-"""Channels that ONNX Runtime's convolutions take at once with AVX-512, a multiple of other processors'."""
-BLOCK = 128
-"""Weights that share a scale in int8."""
+CHANNEL_BLOCK = 16
+"""Channels that ONNX Runtime's convolutions process at once with AVX-512; with other processors fewer."""
+SCALE_BLOCK = 128
+"""Number of int8 weights with a common scale."""
 CHECKED_STEPS = 20
-"""Streamed steps that are compared: states that are mixed up agree on the first one."""
+"""Number of consecutive steps that are compared; an error in the state does not show in the first step."""
 TOLERANCE = {"fp32": 1e-4, "int8": 0.05}
-"""Largest difference from the checkpoint, where a typical step of the training and a typical turn are 1. That
-of int8 is there to notice broken files; what int8 costs is told by the drift."""
+"""Largest difference from the checkpoint, in units of a typical step and a typical turn of the training. For
+int8 it only detects broken files; the drift shows the accuracy."""
 
 ABOUT = """Odometry from a 2D laser: the step between two consecutive scans.
 Inputs: scans (1, 2, {bins}) float32, the depth vectors of the earlier and the later scan in metres{state_in}.
@@ -56,25 +56,25 @@ expected. step is then where the later scan was taken, seen from there. rcnn_odo
 
 
 class _Step(nn.Module):
-    """What the file computes."""
+    """The computation of the exported graph."""
 
     def __init__(self, model: TrainedModel) -> None:
         super().__init__()
         self.model = model
 
     def forward(self, scans: Tensor, *state: Tensor) -> tuple[Tensor, ...]:
-        """Step (1, 3), covariance (1, 3, 3) and the state after it, of scans (1, 2, bins) and the state."""
+        """Step (1, 3), its covariance (1, 3, 3) and the next state, from scans (1, 2, bins) and the state."""
         steps, covariances, after = self.model(scans[None], state)
         return steps[0], covariances[0], *after
 
 
 def to_onnx(model: TrainedModel, precision: str) -> "onnx.ModelProto":
-    """The graph of one step of a trained model, with all that its user has to know.
+    """Converts one step of a trained model to an ONNX graph, with the metadata that its users need.
 
     Args:
-        model: in evaluation mode, on the CPU.
-        precision: ``fp32``, or ``int8``: the weights of all products in 8 bits, those of ``BLOCK`` inputs
-            under one scale; the convolutions, whose weights are few, stay in fp32.
+        model: a model in evaluation mode on the CPU.
+        precision: ``fp32`` or ``int8``. With ``int8`` the weights of all matrix products have 8 bits, with
+            one scale for ``SCALE_BLOCK`` inputs. The convolutions have few weights and stay in fp32.
     """
     graph = _trace(model)
     if precision == "int8":
@@ -87,10 +87,10 @@ def to_onnx(model: TrainedModel, precision: str) -> "onnx.ModelProto":
 
 
 def write(graph: "onnx.ModelProto", path: Path) -> None:
-    """Writes the file, whole or not at all.
+    """Writes the file completely or not at all.
 
     Raises:
-        InputError: it cannot be written.
+        InputError: the file cannot be written.
     """
     try:
         write_atomically(path, graph.SerializeToString())
@@ -99,17 +99,17 @@ def write(graph: "onnx.ModelProto", path: Path) -> None:
 
 
 def write_metadata(model: "onnx.ModelProto", content: dict[str, Any]) -> None:
-    """Plain values as what the file tells of itself."""
+    """Stores plain values in the metadata of the file."""
     from onnx import helper
 
     helper.set_model_props(model, {METADATA: json.dumps(content), "about": model.doc_string})
 
 
-def check(stepper: OnnxStepper, model: TrainedModel) -> None:
-    """Compares a graph with its model over steps of random scans with a carried state, covariances too.
+def compare_with_model(stepper: OnnxStepper, model: TrainedModel) -> None:
+    """Compares a graph with its model over consecutive random scans: steps and covariances.
 
     Raises:
-        InputError: it does not do what the model does.
+        InputError: the difference is above ``TOLERANCE``.
     """
     rng = np.random.default_rng(0)
     sensor = model.describe().input_sensor
@@ -127,19 +127,19 @@ def check(stepper: OnnxStepper, model: TrainedModel) -> None:
 
 
 def _difference(got: FloatArray, expected: FloatArray, typical: FloatArray) -> float:
-    """The largest difference between steps (N, 3, 4) of :func:`_stream`, in typical steps (3,).
+    """The largest difference between steps (N, 3, 4) of :func:`_stream`, relative to typical steps (3,).
 
-    It is inf where one knows what is unknown to the other.
+    It is inf if a value is known (not nan) in only one of them.
     """
     known = np.isfinite(expected)
-    known[..., 0] = True  # nan is no step
+    known[..., 0] = True  # A step must not be nan.
     if (np.isfinite(got) != known).any():
         return float("inf")
-    # A robot that hardly moves sideways has no scale of its own for that: x and y share one.
+    # x and y have a common scale, since a robot may hardly move sideways.
     metres = np.sqrt(np.nansum(np.square(typical[:2])))
     units = np.array([metres, metres, typical[2]])
     units = np.where(units > 0, units, 1.0)
-    # What a deviation is wrong by stands in its square times twice the deviation.
+    # An error e of a standard deviation s changes the variance by about 2 s e.
     deviations = np.sqrt(np.abs(np.nan_to_num(np.diagonal(expected[..., 1:], axis1=1, axis2=2))))
     scales = np.empty_like(expected)
     scales[..., 0] = units
@@ -148,19 +148,19 @@ def _difference(got: FloatArray, expected: FloatArray, typical: FloatArray) -> f
 
 
 def _stream(stepper: Stepper, pairs: list[Any]) -> FloatArray:
-    """Steps (N, 3, 4) from the beginning on: x, y and heading in the first column, covariances beside it."""
+    """Streams pairs of scans; returns (N, 3, 4): x, y, heading in the first column, then the covariance."""
     stepper.reset()
     steps = [stepper(pair) for pair in pairs]
     return np.array([np.column_stack([step.array(), step.covariance]) for step in steps])
 
 
 def _trace(model: TrainedModel) -> "onnx.ModelProto":
-    """The graph in fp32, every product a ``MatMul`` with its weights."""
-    # One tensor for two states, as zeros may be, would make them one input.
+    """Traces the graph in fp32; every matrix product becomes a ``MatMul`` with constant weights."""
+    # Cloned, since two states that share one tensor of zeros would become one input.
     state = {name: value.clone() for name, value in model.initial_state().items()}
     arguments = torch.zeros(1, 2, model.describe().input_sensor.bins), *state.values()
     outputs = ["step", "covariance", *(f"{name}_out" for name in state)]
-    with _quiet(), torch.no_grad():
+    with _suppress_output(), torch.no_grad():
         program = torch.onnx.export(
             _Step(model).eval(), arguments, dynamo=True, input_names=["scans", *state], output_names=outputs
         )
@@ -171,18 +171,20 @@ def _trace(model: TrainedModel) -> "onnx.ModelProto":
 
 
 def _quantize(model: "onnx.ModelProto") -> "onnx.ModelProto":
-    """The same graph with the weights of all products in 8 bits."""
-    # The uncertainty's few weights would be quantized for nothing.
-    few = {weight.name for weight in model.graph.initializer if weight.dims and weight.dims[0] < LANES}
-    with _quiet():
+    """Converts the weights of all matrix products to 8 bits."""
+    # Quantizing the few weights of the uncertainty has no benefit.
+    small = {
+        weight.name for weight in model.graph.initializer if weight.dims and weight.dims[0] < CHANNEL_BLOCK
+    }
+    with _suppress_output():
         from onnxruntime.quantization.matmul_nbits_quantizer import MatMulNBitsQuantizer
 
         quantizer = MatMulNBitsQuantizer(
             model,
-            block_size=BLOCK,
+            block_size=SCALE_BLOCK,
             is_symmetric=True,
-            accuracy_level=4,  # multiplies in int8 as well
-            nodes_to_exclude=[node.name for node in model.graph.node if few & set(node.input)],
+            accuracy_level=4,  # Products are computed in int8, too.
+            nodes_to_exclude=[node.name for node in model.graph.node if small & set(node.input)],
             bits=8,
         )
         quantizer.process()
@@ -190,7 +192,7 @@ def _quantize(model: "onnx.ModelProto") -> "onnx.ModelProto":
 
 
 def _gemm_to_matmul(model: "onnx.ModelProto") -> None:
-    """Turns ``Gemm(x, W transposed)`` into ``MatMul``, the only one whose weights can be quantized."""
+    """Converts ``Gemm(x, W transposed)`` to ``MatMul``, the only operator whose weights can be quantized."""
     from onnx import numpy_helper
 
     weights = {weight.name: weight for weight in model.graph.initializer}
@@ -205,10 +207,10 @@ def _gemm_to_matmul(model: "onnx.ModelProto") -> None:
 
 
 def _matmul_to_convolution(model: "onnx.ModelProto") -> None:
-    """Turns products of one row with many weights into convolutions of one point.
+    """Converts large matrix-vector products to convolutions with kernels of size 1.
 
-    They are the same, but ONNX Runtime's kernel for them reads the weights faster: 9.3 against 11.0 ms for
-    14,464 x 4,096 on two cores of an AMD EPYC, where reading alone takes 8.2.
+    The result is the same, but ONNX Runtime reads the weights faster: 9.3 instead of 11.0 ms for 14,464 x
+    4,096 weights on two cores of an AMD EPYC, where reading alone takes 8.2 ms.
     """
     graph = model.graph
     weights = {weight.name: weight for weight in graph.initializer}
@@ -216,7 +218,7 @@ def _matmul_to_convolution(model: "onnx.ModelProto") -> None:
     nodes = []
     for node in graph.node:
         weight = weights.get(node.input[1]) if node.op_type == "MatMul" else None
-        if weight is None or len(weight.dims) != 2 or weight.dims[1] % LANES:
+        if weight is None or len(weight.dims) != 2 or weight.dims[1] % CHANNEL_BLOCK:
             nodes.append(node)
             continue
         nodes += _point_convolution(node, weight, graph.initializer, ranks[node.output[0]])
@@ -225,18 +227,18 @@ def _matmul_to_convolution(model: "onnx.ModelProto") -> None:
 
 
 def _point_convolution(node: Any, weight: Any, constants: Any, rank: int) -> list[Any]:
-    """The nodes in place of one product, whose weights (inputs, outputs) become a kernel.
+    """The nodes that replace one product, whose weights (inputs, outputs) become a kernel.
 
     Args:
-        node: the ``MatMul``.
-        weight: its weights in the graph.
-        constants: of the graph, to be added to.
-        rank: of the product's result.
+        node: the ``MatMul`` node.
+        weight: its weights in the graph; changed in place.
+        constants: the constants of the graph, to which some are added.
+        rank: number of dimensions of the product.
     """
     from onnx import helper, numpy_helper
 
     (inputs, outputs), name = weight.dims, weight.name
-    padding = -inputs % LANES
+    padding = -inputs % CHANNEL_BLOCK
     kernel = np.pad(numpy_helper.to_array(weight), ((0, padding), (0, 0))).T[..., None, None]
     weight.CopyFrom(numpy_helper.from_array(np.ascontiguousarray(kernel), name))
     shapes = {"image": np.array([1, inputs, 1, 1]), "row": np.array([1] * (rank - 1) + [outputs])}
@@ -254,7 +256,7 @@ def _point_convolution(node: Any, weight: Any, constants: Any, rank: int) -> lis
 
 
 def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
-    """In words what goes in and comes out."""
+    """Writes a description of inputs and outputs into the graph."""
     described = model.describe()
     sensor, state = described.input_sensor, model.initial_state()
     names = " and ".join(f"{name} {tuple(value.shape)}" for name, value in state.items())
@@ -271,19 +273,20 @@ def _describe(graph: "onnx.ModelProto", model: TrainedModel) -> None:
     if described.warping is not None:
         graph.doc_string += RESIDUAL
     graph.producer_name, graph.producer_version = "rcnn-odom", __version__
-    for node in graph.graph.node:  # where each came from in this project's code, of no use to others
+    for node in graph.graph.node:  # Places in the source code of this project.
         del node.metadata_props[:]
 
 
 def _metadata(model: TrainedModel) -> dict[str, Any]:
-    # JSON has no nan: null stands for it.
-    told = json.loads(json.dumps(asdict(model.describe())), parse_constant=lambda _: None)
-    return {"version": __version__, "variant": model.name, "format": FORMAT, **told}
+    """The metadata of a model as plain values."""
+    # JSON has no nan, so it becomes null.
+    description = json.loads(json.dumps(asdict(model.describe())), parse_constant=lambda _: None)
+    return {"version": __version__, "variant": model.name, "format": FORMAT, **description}
 
 
 @contextmanager
-def _quiet() -> Iterator[None]:
-    """Keeps what exporter and quantizer say of their own steps off the terminal."""
+def _suppress_output() -> Iterator[None]:
+    """Suppresses messages of the exporter and the quantizer."""
     root = logging.getLogger()
     handlers, level = root.handlers[:], root.level
     logging.disable(logging.WARNING)
@@ -293,6 +296,6 @@ def _quiet() -> Iterator[None]:
             yield
     finally:
         logging.disable(logging.NOTSET)
-        # The quantizer's module sets up logging for the whole program when it is imported.
+        # Importing the quantizer changes the logging of the whole program.
         root.handlers[:] = handlers
         root.setLevel(level)

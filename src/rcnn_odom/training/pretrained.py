@@ -1,4 +1,4 @@
-"""Weights that a training begins with, ``model.pretrained``: of the same model, or of its first stage."""
+"""The initial weights of a training, ``model.pretrained``: those of the same model or of its first stage."""
 
 import logging
 from dataclasses import fields
@@ -18,26 +18,30 @@ from rcnn_odom.training.modules import OdometryModule
 
 log = logging.getLogger(__name__)
 
-NOT_OF_THE_NETWORK = ("variant", "first_stage", "pretrained")
-"""Options that a checkpoint does not keep: it says what a network is, not where its weights came from."""
+NOT_IN_CHECKPOINT = ("variant", "first_stage", "pretrained")
+"""Options that are not saved in a checkpoint, since they do not describe the network."""
 LEAST_SCANS, LEAST_METRES = 2000, 200.0
-"""Of drives to fine-tune on; a network knows fewer of them by heart after a few epochs."""
+"""Smallest amount of data for fine-tuning; a network overfits to less within a few epochs."""
 
 
 def options_of_network(model: Settings) -> dict[str, Any]:
-    """Those of the options ``model`` that a checkpoint keeps."""
-    return {key: value for key, value in model.items() if key not in NOT_OF_THE_NETWORK}
+    """The options of ``model`` that are saved in a checkpoint.
+
+    >>> options_of_network({"variant": "cnn_reg", "kernel_size": 3, "pretrained": None})
+    {'kernel_size': 3}
+    """
+    return {key: value for key, value in model.items() if key not in NOT_IN_CHECKPOINT}
 
 
 def read_pretrained(settings: Settings) -> OdometryModule | None:
-    """The trained network that a training begins with; None: ``model.pretrained`` names none.
+    """Loads the network of ``model.pretrained``; None if the option is not set.
 
     Args:
-        settings: of the training.
+        settings: settings of the training.
 
     Raises:
-        InputError: there is no such checkpoint, or it is of a model, a sensor or a network that does not fit.
-            Whether a first stage has the right network is seen when it is taken.
+        InputError: there is no such checkpoint, or its model, sensor or network does not fit. The network of
+            a first stage is checked later, when its weights are copied.
     """
     path, variant = settings["model"].get("pretrained"), settings["model"]["variant"]
     if not path:
@@ -57,62 +61,69 @@ def read_pretrained(settings: Settings) -> OdometryModule | None:
 
 
 def _check_network(path: str, given: OdometryModule, model: Settings) -> None:
-    """Compares the options that say what a network computes.
+    """Compares the options that determine the output of a network.
 
     Raises:
-        InputError: some differ; they are named with both values.
+        InputError: some options differ; the message names both values.
     """
     free = {each.name for each in fields(Recipe)} | set(given.model.only_in_training)
-    theirs, ours = (
+    trained, wanted = (
         flat({name: value for name, value in options_of_network(options).items() if name not in free})
         for options in (given.model.options, model)
     )
-    others = [name for name in ours if name in theirs and theirs[name] != ours[name]]
-    if others:
-        have = ", ".join(f"model.{name} is {ours[name]}" for name in others)
-        need = " ".join(f"model.{name}={theirs[name]}" for name in others)
+    different = [name for name in wanted if name in trained and trained[name] != wanted[name]]
+    if different:
+        have = ", ".join(f"model.{name} is {wanted[name]}" for name in different)
+        need = " ".join(f"model.{name}={trained[name]}" for name in different)
         raise InputError(f"{path}: another network, {have} here; set {need} as in that training")
 
 
-def take_weights(given: OdometryModule, module: OdometryModule, path: str) -> None:
-    """Gives a module all weights of a trained one of the same model.
+def copy_weights(given: OdometryModule, module: OdometryModule, path: str) -> None:
+    """Copies all weights of a trained module to another module of the same model.
+
+    Args:
+        given: the trained module.
+        module: gets the weights.
+        path: path of the checkpoint of ``given``, for messages.
 
     Raises:
-        InputError: they have other shapes.
+        InputError: the weights have other shapes.
     """
     try:
         module.model.take_weights(given.model)
-    except RuntimeError as error:  # what torch says of shapes takes many lines
+    except RuntimeError as error:  # The message of torch has a line for each weight.
         raise InputError(f"{path}: another network, its weights have other shapes; train it again") from error
 
 
-def begin_with(given: OdometryModule, module: OdometryModule, path: str, data: OdometryDataModule) -> Report:
-    """Gives a module the weights that its training begins with, and says what the training may expect.
+def start_from_pretrained(
+    given: OdometryModule, module: OdometryModule, path: str, data: OdometryDataModule
+) -> Report:
+    """Copies the initial weights to a module, and logs their validation drift.
 
     Args:
-        given: trained, of the same model.
-        module: to be trained.
-        path: of the checkpoint ``given``.
-        data: its drives.
+        given: the trained module of the same model.
+        module: the module to be trained.
+        path: path of the checkpoint of ``given``.
+        data: the drives of the training.
 
     Returns:
-        What ``metrics.json`` says of it: ``path``, and ``val_drift`` of the weights as given, a ratio; None
-        where the validation drives are too short to score.
+        The entry ``pretrained`` of ``metrics.json``: ``path``, and ``val_drift``, the validation drift of the
+        initial weights as a ratio; None if the validation drives are too short to score.
 
     Raises:
-        InputError: as :func:`take_weights`.
+        InputError: see :func:`copy_weights`.
     """
-    take_weights(given, module, path)
+    copy_weights(given, module, path)
     drift = validation_drift(module, data)
-    told = "" if drift is None else f"; validation drift before training: {drift:.2%}"
-    log.info("going on from the weights of %s%s", path, told)
+    score = "" if drift is None else f"; validation drift before training: {drift:.2%}"
+    log.info("starting from the weights of %s%s", path, score)
     if not data.fresh_epochs:
-        warn_of_little(data)
+        warn_if_few_data(data)
     return {"pretrained": {"path": path, "val_drift": drift}}
 
 
 def validation_drift(module: OdometryModule, data: OdometryDataModule) -> float | None:
-    """Mean drift, a ratio, of the validation drives as a network estimates them now."""
+    """Mean drift of a network on the validation drives, as a ratio; None if they are too short to score."""
     module.eval()
     drives = data.drives["val"]
     each = [DRIFT.compute(drive, module.model.estimate(drive), module.lengths) for drive in drives]
@@ -120,21 +131,21 @@ def validation_drift(module: OdometryModule, data: OdometryDataModule) -> float 
     return DRIFT.over(each, [len(drive) - 1 for drive in drives])
 
 
-def warn_of_little(data: OdometryDataModule) -> None:
-    """Warns where the training drives are too short to fine-tune a network on."""
+def warn_if_few_data(data: OdometryDataModule) -> None:
+    """Warns if the training drives are too short for fine-tuning."""
     scans = sum(map(len, data.drives["train"]))
     metres = float(np.hypot(*data.training_steps()[:, :2].T).sum())
     if scans < LEAST_SCANS or metres < LEAST_METRES:
         log.warning(
-            "fine-tuning on %d scans and %.0f m, too little to learn from (at least %d scans and %.0f m): "
-            "the network learns these drives by heart and gets worse on others; give more recordings, or use "
-            "the given network as it is",
+            "fine-tuning on %d scans and %.0f m is too little data (recommended: %d scans and %.0f m or "
+            "more): the network overfits to these drives and gets worse on others; give more recordings, or "
+            "use the given network without fine-tuning",
             *(scans, metres, LEAST_SCANS, LEAST_METRES),
         )
 
 
 def warn_if_worse(metrics: Report) -> None:
-    """Warns where a fine-tuning has no better validation than the weights that it began with."""
+    """Warns if fine-tuning has not lowered the validation drift of the initial weights."""
     before, after = (metrics.get("pretrained") or {}).get("val_drift"), metrics["val"]["drift"]
     if before is not None and after is not None and after >= before:
         log.warning(

@@ -1,4 +1,4 @@
-"""Training in several processes: their errors and signals, as if there were one."""
+"""Errors and signals of training in several processes, handled as in a single process."""
 
 import logging
 import multiprocessing
@@ -13,44 +13,44 @@ from rcnn_odom.errors import InputError
 from rcnn_odom.training import cluster
 from rcnn_odom.training.saving import SIGNALS, Stopped, TimeUp
 
-# It warns of every process that it ends because another one has failed.
+# It logs a warning for every process that it ends after another one has failed.
 logging.getLogger("torch.multiprocessing").setLevel(logging.ERROR)
 
 
 @contextmanager
 def one_line_errors(trainer: L.Trainer) -> Iterator[None]:
-    """Around a trainer's work, which it may do in other processes.
+    """Translates the errors of a Trainer that may work in other processes.
 
     Raises:
-        InputError: one of them met a mistake of the user, or was killed.
-        Stopped: they were asked to stop, and have saved.
-        TimeUp: they have had their time, and have saved.
+        InputError: a process has found a mistake of the user, or was killed.
+        Stopped: the processes were stopped by a signal, and have saved a checkpoint.
+        TimeUp: the processes have reached the time limit, and have saved a checkpoint.
     """
-    with _signals_passed_on(trainer) as asked:
+    with _pass_signals_on(trainer) as received:
         try:
             yield
         except ProcessRaisedException as error:
-            raise _translate(error, asked=bool(asked)) from error
+            raise _translate(error, received=bool(received)) from error
         except ProcessExitedException as error:
-            if asked:
+            if received:
                 raise Stopped from error
             raise InputError(
-                "a training process was killed, perhaps for want of memory; the same command goes on from "
+                "a training process was killed, perhaps for lack of memory; the same command continues from "
                 "the last checkpoint"
             ) from error
         except RuntimeError as error:
-            raise cluster.lost(error) from error
+            raise cluster.translate_lost_process(error) from error
 
 
-def _translate(error: ProcessRaisedException, *, asked: bool) -> Exception:
-    """The error behind the traceback of another process, which is all that comes from there."""
+def _translate(error: ProcessRaisedException, *, received: bool) -> Exception:
+    """The original error, from the traceback of another process."""
     for line in str(error).splitlines():
         kind, _, message = line.partition(":")
         if kind == f"{InputError.__module__}.{InputError.__name__}":
             return InputError(message.strip())
         if kind == OSError.__name__:
-            return InputError(f"{message.strip()}; make room, and the same command goes on")
-        if asked or kind == f"{Stopped.__module__}.{Stopped.__name__}":
+            return InputError(f"{message.strip()}; make room, then repeat the command")
+        if received or kind == f"{Stopped.__module__}.{Stopped.__name__}":
             return Stopped()
         if kind == f"{TimeUp.__module__}.{TimeUp.__name__}":
             return TimeUp()
@@ -58,28 +58,28 @@ def _translate(error: ProcessRaisedException, *, asked: bool) -> Exception:
 
 
 @contextmanager
-def _signals_passed_on(trainer: L.Trainer) -> Iterator[list[int]]:
-    """Lets the processes that train save and stop, instead of ending the one that waits for them.
+def _pass_signals_on(trainer: L.Trainer) -> Iterator[list[int]]:
+    """Passes signals on to the processes that train, so that they save and stop.
 
     Yields:
-        The signals that have come.
+        The signals that were received.
     """
-    asked: list[int] = []
+    received: list[int] = []
     if trainer.world_size == 1 or cluster.has_joined():
-        yield asked
+        yield received
         return
 
     def pass_on(number: int, frame: object) -> None:
         processes = multiprocessing.active_children()
-        if asked or not processes:
+        if received or not processes:
             raise KeyboardInterrupt
-        asked.append(number)
+        received.append(number)
         for process in processes:
             process.terminate()
 
     before = {number: signal.signal(number, pass_on) for number in SIGNALS}
     try:
-        yield asked
+        yield received
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)

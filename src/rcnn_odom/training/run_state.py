@@ -1,4 +1,4 @@
-"""What a run is: new, stopped, finished, a twin of a finished one, or in another process' hands."""
+"""The state of a run: new, stopped, finished, the same as a finished one, or locked by another process."""
 
 import ast
 import hashlib
@@ -31,7 +31,7 @@ from rcnn_odom.files import lock_if_free, one_at_a_time, write_atomically
 from rcnn_odom.training.settings import Settings
 from rcnn_odom.training.trainer_options import WITHOUT_EFFECT
 
-if TYPE_CHECKING:  # torch would make --help slow
+if TYPE_CHECKING:  # Importing torch would make --help slow.
     from rcnn_odom.training.datamodule import OdometryDataModule
 
 log = logging.getLogger(__name__)
@@ -46,27 +46,28 @@ DECIDING = (
     *("training/pretrained.py", "training/matcher_truth.py", "training/averaging.py"),
     *("evaluation/drift.py", "evaluation/drift_metric.py"),
 )
-"""Sources that decide what a training gives."""
+"""Sources that determine the result of a training."""
 
 LINKED = (
     *(CONFIG, METRICS, "train.log", "checkpoints", "trajectories", "figures"),
     *("model.onnx", "model_int8.onnx"),
 )
-"""What of a run is also seen in ``outputs/latest``: not its curves, which TensorBoard would show twice."""
+"""Files and folders of a run with a link in ``outputs/latest``; without the curves, which TensorBoard would
+show twice."""
 
 
 ELSEWHERE = {"run_dir": None, "outputs": None}
-"""Settings that say where a run is, not what it is."""
+"""Settings for the place of a run, which do not change its result."""
 
 
-def _deciding(settings: Settings) -> Settings:
-    """The settings that say what a run is, whatever time it was given."""
+def _deciding_settings(settings: Settings) -> Settings:
+    """The settings with neutral values for those that do not change the result of a training."""
     trainer, model = settings["trainer"], _drop_unused(settings["model"])
     return settings | ELSEWHERE | {"trainer": trainer | dict.fromkeys(WITHOUT_EFFECT), "model": model}
 
 
 def _drop_unused(model: Settings) -> Settings:
-    """The options of a model without averaging where it is off, as in runs of versions that had none."""
+    """Removes ``averaging`` if it is off, as in runs of versions without that option."""
     kept = {name: value for name, value in model.items() if name != "averaging" or value}
     if isinstance(model.get("first_stage"), dict):
         kept["first_stage"] = _drop_unused(model["first_stage"])
@@ -74,22 +75,23 @@ def _drop_unused(model: Settings) -> Settings:
 
 
 class State(Enum):
-    """What a run's folder holds."""
+    """The state of a run's folder."""
 
     NEW = auto()
-    STOPPED = auto()  # begun with these settings and not finished, and no process trains it
+    STOPPED = auto()  # started with these settings, not finished, and no process trains it
     FINISHED = auto()
-    TWIN = auto()  # not finished, but another run has finished the very same training
+    TWIN = auto()  # not finished, but another run has finished exactly the same training
     LOCKED = auto()  # another process trains it
     OTHER = auto()  # a run with other settings, or on other recordings
 
 
 class Fingerprints(NamedTuple):
-    """Hashes of all that decides what a training gives.
+    """Hashes of everything that determines the result of a training.
 
     Attributes:
-        settings: recordings, options, seed: whether a stopped run may go on from its checkpoint.
-        code: whether, beside them, a finished run would come out the same today.
+        settings: hash of recordings, options and seed. A stopped run may continue if it is the same.
+        code: hash of the source code. A finished run may be used in place of a new training if both are the
+            same.
     """
 
     settings: str
@@ -97,7 +99,7 @@ class Fingerprints(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A run's state, and the folder that has the weights: of a twin not the run's own."""
+    """The state of a run, and the folder with its weights; for a twin, the folder of the other run."""
 
     state: State
     run: Path
@@ -106,24 +108,24 @@ class Found(NamedTuple):
 def state_of(
     run: Path, settings: Settings, wanted: Fingerprints | None = None, twins_in: Path | None = None
 ) -> Found:
-    """What a run is; the only place that decides it.
+    """Determines the state of a run.
 
     Args:
-        run: its folder, which need not exist.
-        settings: of the training that is wanted.
-        wanted: its fingerprints, once its recordings are known.
-        twins_in: where to look for a finished run with the same fingerprints; None: nowhere.
+        run: folder of the run, which need not exist.
+        settings: settings of the wanted training.
+        wanted: fingerprints of the wanted training; None before its recordings are loaded.
+        twins_in: folder to search for a finished run with the same fingerprints; None: no search.
 
     Raises:
-        InputError: the folder has a configuration that is none of a run.
+        InputError: the configuration in the folder is not that of a run.
     """
-    begun = (run / CONFIG).exists()
-    is_same = begun and _deciding(read_settings(run)) == _deciding(settings)
+    has_started = (run / CONFIG).exists()
+    is_same = has_started and _deciding_settings(read_settings(run)) == _deciding_settings(settings)
     if has_finished(run):
-        metrics = _metrics_of(run) if is_same else {}
+        metrics = _read_metrics(run) if is_same else {}
         finished = metrics and (wanted is None or metrics.get("fingerprint") == wanted.settings)
         return Found(State.FINISHED if finished else State.OTHER, run)
-    if begun and not is_same:
+    if has_started and not is_same:
         return Found(State.OTHER, run)
     if run.resolve() not in _claims and run.is_dir():
         with lock_if_free(run / RUNNING) as free:
@@ -131,11 +133,11 @@ def state_of(
                 return Found(State.LOCKED, run)
     if twins_in and wanted and (twin := _find_twin(twins_in, wanted)):
         return Found(State.TWIN, twin)
-    return Found(State.STOPPED if begun else State.NEW, run)
+    return Found(State.STOPPED if has_started else State.NEW, run)
 
 
-def _metrics_of(run: Path) -> dict[str, Any]:
-    """What a run's ``metrics.json`` holds; nothing where that is damaged."""
+def _read_metrics(run: Path) -> dict[str, Any]:
+    """The content of a run's ``metrics.json``; an empty dictionary if it is missing or damaged."""
     with suppress(OSError, ValueError):
         return read_metrics_file(run)
     return {}
@@ -145,18 +147,18 @@ def _find_twin(outputs: Path, wanted: Fingerprints) -> Path | None:
     """The newest finished run with these fingerprints."""
     for path in sorted(outputs.rglob(METRICS), key=lambda path: path.lstat().st_mtime, reverse=True):
         run = path.parent
-        metrics = _metrics_of(run) if (run / BEST).exists() and stopped_by(run) is None else {}
+        metrics = _read_metrics(run) if (run / BEST).exists() and stopped_by(run) is None else {}
         if not path.is_symlink() and (metrics.get("fingerprint"), metrics.get("code")) == wanted:
             return run
     return None
 
 
 def find_stopped(folder: Path, settings: Settings) -> Path | None:
-    """The newest stopped run with these settings in a folder; from here on it is this process' own."""
+    """Finds the newest stopped run with these settings in a folder, and locks it for this process."""
     runs = [config.parent for config in folder.glob(f"*/{CONFIG}")]
     for run in sorted(runs, key=lambda run: (run / CONFIG).stat().st_mtime, reverse=True):
-        with suppress(InputError, OSError):  # of a stranger's folder
-            # The second look is for what another process did between the first and the lock.
+        with suppress(InputError, OSError):  # A foreign folder can have any content.
+            # Checked again after locking, since another process may have trained the run meanwhile.
             if state_of(run, settings).state is State.STOPPED and _claim(run):
                 if state_of(run, settings).state is State.STOPPED:
                     return run
@@ -165,11 +167,11 @@ def find_stopped(folder: Path, settings: Settings) -> Path | None:
 
 
 _claims: dict[Path, ExitStack] = {}
-"""Locks of the runs that are this process' own, until it lets go of them or ends."""
+"""Locks of runs that this process holds."""
 
 
 def _claim(run: Path) -> bool:
-    """Makes a run this process' own, unless another process has it."""
+    """Locks a run for this process; returns False if another process holds the lock."""
     with ExitStack() as stack:
         if run.resolve() not in _claims:
             if not stack.enter_context(lock_if_free(run / RUNNING)):
@@ -179,32 +181,34 @@ def _claim(run: Path) -> bool:
 
 
 def _release(run: Path) -> None:
+    """Releases the lock of a run."""
     _claims.pop(run.resolve()).close()
 
 
 @contextmanager
-def entered(run: Path, settings: Settings) -> Iterator[None]:
-    """Makes a run's folder with its resolved configuration, or enters a stopped run.
+def open_run(run: Path, settings: Settings) -> Iterator[None]:
+    """Creates the folder of a run with its resolved configuration, or opens that of a stopped run.
 
-    Other processes are kept away from it until the end.
+    The run is locked against other processes until the context ends.
 
     Raises:
-        InputError: it is finished, has other settings, is trained by another process, or cannot be written.
+        InputError: the run is finished, has other settings, is trained by another process, or its folder
+            cannot be written.
     """
     if has_finished(run):
         raise InputError(f"{run}: holds a finished run; choose another run_dir")
     if state_of(run, settings).state is State.OTHER:
         raise InputError(
-            f"{run / CONFIG}: the run was begun with other settings; repeat them, or choose another run_dir"
+            f"{run / CONFIG}: the run was started with other settings; repeat them, or choose another run_dir"
         )
     try:
         run.mkdir(parents=True, exist_ok=True)
         if not _claim(run):
             raise InputError(f"{run}: another process is training this run; wait, or choose another run_dir")
-        if has_finished(run):  # by another process since the first look
+        if has_finished(run):  # Another process has finished it meanwhile.
             _release(run)
             raise InputError(f"{run}: holds a finished run; choose another run_dir")
-        for left_over in (run / LAST).parent.glob(".*.partial"):  # of a process that was killed
+        for left_over in (run / LAST).parent.glob(".*.partial"):  # Files of a process that was killed.
             left_over.unlink(missing_ok=True)
         write_config(run, settings)
     except OSError as error:
@@ -217,11 +221,12 @@ def entered(run: Path, settings: Settings) -> Iterator[None]:
 
 
 def check_checkpoint(path: Path, saved: dict[str, Any], wanted: Fingerprints) -> None:
-    """Looks whether a stopped training may go on from what it saved; says so if the code changed since.
+    """Checks that a training may continue from a checkpoint; logs if the code has changed.
 
     Args:
-        path: of the checkpoint ``saved``.
-        wanted: fingerprints of the training that is to go on.
+        path: path of the checkpoint.
+        saved: content of the checkpoint.
+        wanted: fingerprints of the training.
 
     Raises:
         InputError: the checkpoint belongs to another training.
@@ -229,18 +234,18 @@ def check_checkpoint(path: Path, saved: dict[str, Any], wanted: Fingerprints) ->
     if saved.get("fingerprint") != wanted.settings:
         raise InputError(
             f"{path}: saved by a training on other recordings or with another version of rcnn_odom; "
-            "choose another run_dir, or remove it to begin again"
+            "choose another run_dir, or remove it to start again"
         )
     if saved.get("code") != wanted.code:
-        log.info("the code has changed since this run began; what follows is trained by the new code")
+        log.info("the code has changed since this run was started; the remaining steps use the new code")
 
 
 def fingerprints(settings: Settings, datamodule: "OdometryDataModule") -> Fingerprints:
-    """Those of a training whose recordings are loaded."""
-    from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
+    """The fingerprints of a training whose recordings are loaded."""
+    from rcnn_odom.models.contract import find_model  # Imports torch, which would make --help slow.
     from rcnn_odom.recordings.formats import find_format
 
-    # Models and formats may come from other packages.
+    # Models and formats can come from other packages.
     parts = find_model(settings["model"]["variant"]), find_format(settings["data"]["reader"]["format"])
     sources = [Path(source) for part in parts if (source := inspect.getsourcefile(part))]
     return Fingerprints(settings_fingerprint(settings, datamodule), code_fingerprint(PACKAGE, sources))
@@ -248,7 +253,7 @@ def fingerprints(settings: Settings, datamodule: "OdometryDataModule") -> Finger
 
 def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -> str:
     """Hash of a training's recordings, options and seed."""
-    from rcnn_odom.training.machine import resolve_precision  # with torch, which would make --help slow
+    from rcnn_odom.training.machine import resolve_precision
 
     recordings = {
         split: [
@@ -258,71 +263,74 @@ def settings_fingerprint(settings: Settings, datamodule: "OdometryDataModule") -
         for split in ("train", "val")
     }
     data = {key: settings["data"][key] for key in ("augment", "lengths", "apply", "sensor")}
-    if settings["data"].get("fresh_worlds"):  # drives that are not among the recordings yet
+    # With new worlds, later epochs have drives that are not among the recordings yet.
+    if settings["data"].get("fresh_worlds"):
         data["fresh_worlds"] = settings["data"]["reader"]
     trainer = {name: value for name, value in settings["trainer"].items() if name not in WITHOUT_EFFECT}
-    precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # of the machine
-    model = _name_weights(_drop_unused(settings["model"]))
+    precision = resolve_precision(trainer["precision"], trainer["accelerator"])  # Depends on the machine.
+    model = _replace_path_by_hash(_drop_unused(settings["model"]))
     parts = [recordings, data, model, trainer | {"precision": precision}, settings["seed"]]
     return hashlib.sha256(json.dumps(parts, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _name_weights(model: Settings) -> Settings:
-    """The options of a model with the hash of the weights that it begins with, in place of their file."""
-    from rcnn_odom.training.checkpoint import weights_fingerprint  # with torch, which would make --help slow
+def _replace_path_by_hash(model: Settings) -> Settings:
+    """The options of a model, with a hash of the initial weights in place of the path ``pretrained``."""
+    # Imports torch, which would make --help slow.
+    from rcnn_odom.training.checkpoint import weights_fingerprint
 
-    named = {name: value for name, value in model.items() if name != "pretrained"}
+    hashed = {name: value for name, value in model.items() if name != "pretrained"}
     if model.get("pretrained"):
-        named["pretrained"] = weights_fingerprint(model["pretrained"])
+        hashed["pretrained"] = weights_fingerprint(model["pretrained"])
     if model.get("first_stage"):
-        named["first_stage"] = _name_weights(model["first_stage"])
-    return named
+        hashed["first_stage"] = _replace_path_by_hash(model["first_stage"])
+    return hashed
 
 
 def code_fingerprint(package: Path, others: Iterable[Path] = ()) -> str:
-    """Hash of the statements that decide a training: comments, docstrings and layout do not count.
+    """Hash of the source code that determines a training, without comments, docstrings and layout.
 
     Args:
         package: the folder of ``rcnn_odom``.
-        others: source files outside of it; those inside count once.
+        others: further source files; one that is already included counts once.
     """
     inside = {path for pattern in DECIDING for path in package.glob(pattern)}
     return hash_statements([*sorted(inside), *sorted(set(others) - inside)])
 
 
 def hash_statements(sources: Iterable[Path]) -> str:
-    """Hash of the statements in source files, in this order."""
+    """Hash of the statements in source files, in the given order."""
     statements = hashlib.sha256()
     for path in sources:
         tree = ast.parse(path.read_bytes())
         for node in ast.walk(tree):
             body = getattr(node, "body", None)
-            if isinstance(body, list):  # a constant that stands alone does nothing
+            if isinstance(body, list):  # A constant alone, such as a docstring, has no effect.
                 node.body = [one for one in body if not _is_constant(one)]  # type: ignore[attr-defined]
         statements.update(f"{path.name}: {ast.dump(tree)}\n".encode())
     return statements.hexdigest()[:16]
 
 
 def _is_constant(statement: ast.stmt) -> bool:
+    """Whether a statement consists of a constant only."""
     return isinstance(statement, ast.Expr) and isinstance(statement.value, ast.Constant)
 
 
 def write_config(folder: Path, settings: Settings) -> None:
-    """The settings into a folder, at once or not at all."""
+    """Writes the settings into a folder, completely or not at all."""
     write_atomically(folder / CONFIG, yaml.safe_dump(settings, sort_keys=False))
 
 
 def write_json(path: Path, content: dict[str, Any]) -> None:
-    """Writes a JSON file at once or not at all."""
+    """Writes a JSON file completely or not at all."""
     write_atomically(path, json.dumps(content, indent=2) + "\n")
 
 
-def point_latest(outputs: Path, run: Path) -> None:
-    """Lets ``latest`` among the runs show this one: a folder of links, also to what is not there yet."""
+def link_latest(outputs: Path, run: Path) -> None:
+    """Makes ``outputs/latest`` a folder of links to this run, also to files that do not exist yet."""
     latest = outputs / "latest"
-    # One process at a time, so that it never shows parts of two runs.
+    # One process at a time, so that the links never point to two runs.
     with one_at_a_time(outputs / "cache", "latest", "pointing outputs/latest to its run"):
-        if latest.is_symlink():  # as earlier versions left it
+        if latest.is_symlink():  # Earlier versions made a link.
             latest.unlink()
         latest.mkdir(exist_ok=True)
         for name in LINKED:

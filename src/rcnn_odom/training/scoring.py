@@ -1,4 +1,4 @@
-"""What ``evaluate.py`` does: scores a run's network, or a model that does not train."""
+"""The job of ``evaluate.py``: scores the network of a run, or a model without training."""
 
 import logging
 import os
@@ -27,13 +27,16 @@ log = logging.getLogger(__name__)
 
 
 def evaluate(cfg: DictConfig) -> Report:
-    """Scores a run's best checkpoint, or a model that does not train; what its ``metrics.json`` holds.
+    """Scores the best checkpoint of a run, or a model without training.
 
     Args:
         cfg: the configuration of ``evaluate.py``.
 
+    Returns:
+        The content of ``metrics.json``.
+
     Raises:
-        InputError: see its message.
+        InputError: the configuration, the run or the recordings are invalid.
     """
     variant = cfg.model.variant if cfg.get("model") else None
     if variant and find_model(variant).trains:
@@ -50,12 +53,12 @@ def evaluate(cfg: DictConfig) -> Report:
     folder = Path(chosen["run_dir"])
     write_config(folder, settings)
     write_json(folder / METRICS, metrics)
-    log.info("all of it is in %s", shlex.quote(str(folder)))
+    log.info("all results are in %s", shlex.quote(str(folder)))
     return metrics
 
 
 def _score_run(chosen: Settings) -> tuple[Settings, Report]:
-    """Settings and metrics of a run's network on its own test drives, or on those of ``data``."""
+    """Scores the network of a run on its own test drives, or on those of ``data``; settings and metrics."""
     run, folder = Path(chosen["run"]), Path(chosen["run_dir"])
     settings = read_settings(run)
     settings |= {key: chosen[key] for key in ("data", "trainer", "outputs") if chosen.get(key)}
@@ -68,12 +71,16 @@ def _score_run(chosen: Settings) -> tuple[Settings, Report]:
         )
     datamodule = build_datamodule(settings).load(("test",))
     scores = score_module(module, datamodule, trainer, settings, folder)
-    of = {"run": os.path.relpath(home_of(run)), "variant": module.variant, "data": settings["data"]["name"]}
-    return settings, {**of, **scores}
+    names = {
+        "run": os.path.relpath(home_of(run)),
+        "variant": module.variant,
+        "data": settings["data"]["name"],
+    }
+    return settings, {**names, **scores}
 
 
 def _score_model(chosen: Settings) -> tuple[Settings, Report]:
-    """Settings and metrics of a model that does not train, on the test drives of ``data``."""
+    """Scores a model without training on the test drives of ``data``; settings and metrics."""
     data, options = chosen["data"], dict(chosen["model"])
     variant = options.pop("variant")
     model = find_model(variant)(options, Sensor(**data["sensor"]))
@@ -90,7 +97,7 @@ def _score_model(chosen: Settings) -> tuple[Settings, Report]:
 
 
 def _latency(model: Model, drive: Drive) -> Report:
-    """The time of a frame on this drive, of what the model looks at."""
+    """Measures the computing time per frame on a drive, from depth vectors or from whole scans."""
     if model.uses_depth_vectors:
         return measure(model.stepper(), drive.scans)
     return measure_tracker(model.tracker(), list(islice(drive.raw_scans(), FRAMES + 1)))

@@ -1,4 +1,4 @@
-"""A run's configuration as plain values, with the mistakes that Hydra cannot see found early."""
+"""Converts a run's configuration to plain values, and finds mistakes that Hydra does not find."""
 
 import re
 from dataclasses import dataclass, fields
@@ -17,10 +17,10 @@ from rcnn_odom.training.defaults import default
 from rcnn_odom.training.overrides import PATHS
 from rcnn_odom.training.trainer_options import (
     TrainerOptions,
-    place,
+    apply_fast_dev_run,
+    check_devices,
     processes_per_node,
     refuse_names,
-    shorten_if_wanted,
 )
 
 # For conf/model.
@@ -35,10 +35,11 @@ RENAMED = {
     "data.rotation_classes": "model.rotation_classes",
     "model=icp": "model=matcher",
 }
-"""Options and choices of earlier versions, and what stands for them now."""
+"""Options and choices of earlier versions, and their present names."""
 
 
-def _names() -> Any:
+def _names_option() -> Any:
+    """An option whose value is a list of different names of sequences."""
     return option(
         fits=lambda names: 0 < len(names) == len(set(map(str, names))),
         wanted="a list of sequences, each once, for instance [a,b]",
@@ -46,10 +47,12 @@ def _names() -> Any:
 
 
 def _are_lengths(lengths: list[Any]) -> bool:
+    """Whether these are lengths in metres."""
     return bool(lengths) and all(type(length) in (int, float) and 0 < length < 1e9 for length in lengths)
 
 
 def _are_numbers(values: list[Any], count: int) -> bool:
+    """Whether these are ``count`` numbers, none negative."""
     return len(values) == count and all(type(value) in (int, float) and 0 <= value < 1e9 for value in values)
 
 
@@ -77,7 +80,7 @@ class AugmentOptions:
 
 @dataclass(kw_only=True)
 class DataOptions:
-    """What the files of ``conf/data`` have in common."""
+    """The options that all files of ``conf/data`` have."""
 
     reader: dict[str, Any] = option(  # noqa: RUF009
         fits=lambda reader: isinstance(reader.get("format"), str),
@@ -85,9 +88,9 @@ class DataOptions:
     )
     sensor: Sensor
     augment: AugmentOptions
-    train: list[Any] | None = _names()  # noqa: RUF009
-    val: list[Any] | None = _names()  # noqa: RUF009
-    test: list[Any] = _names()  # noqa: RUF009
+    train: list[Any] | None = _names_option()  # noqa: RUF009
+    val: list[Any] | None = _names_option()  # noqa: RUF009
+    test: list[Any] = _names_option()  # noqa: RUF009
     lengths: list[Any] = option(  # noqa: RUF009
         fits=_are_lengths, wanted="a list of lengths in metres, for instance [1,2,5]"
     )
@@ -98,28 +101,28 @@ class DataOptions:
 
 @dataclass(kw_only=True)
 class Options:
-    """What every run has, whatever its data and its model."""
+    """The options that every run has, with any data and model."""
 
     trainer: TrainerOptions
     seed: int = option(least=0, below=2**32, wanted="a whole number, not negative")
 
 
 def plain(cfg: DictConfig) -> Settings:
-    """A configuration as plain values.
+    """Converts a configuration to plain values and checks them.
 
     Raises:
-        InputError: a value that the user must give is missing, or one has no meaning.
+        InputError: a required value is missing, or a value is not valid.
     """
     given: Any = OmegaConf.to_container(cfg)
-    _name_paths(given)
-    _name_deskew(given)
+    _convert_paths(given)
+    _convert_deskew(given)
     for name, value in flat(given).items():
         if value == "???":
             raise InputError(f"{name} is missing; give it on the command line, {name}=...")
         if (group := ".".join(name.split(".")[:2])) in RENAMED:
             raise InputError(f"{group} has become {RENAMED[group]}; set that")
-    # Before others are looked up by it, where Hydra would name those and not the mistake.
-    _check(given, complete=False)
+    # Checked before interpolations are resolved, since Hydra would not name the cause of an error there.
+    _check_settings(given, complete=False)
     _check_data_names(given.get("data") or {})
     try:
         settings: Any = OmegaConf.to_container(cfg, resolve=True)
@@ -127,22 +130,24 @@ def plain(cfg: DictConfig) -> Settings:
         raise InputError(f"{error.full_key}: {str(error).splitlines()[0]}") from error
     data = settings.get("data") or {}
     for split in data.keys() & {"train", "val", "test"}:
-        if isinstance(data[split], list):  # where [10] is a number to Hydra, and [00] is not
+        if isinstance(data[split], list):  # Hydra reads [10] as a number, and [00] as text.
             data[split] = [str(name) for name in data[split]]
-    _name_paths(settings)
-    _name_weights(settings.get("model") or {})
-    _name_deskew(settings)
-    _check(settings, complete=True)
+    _convert_paths(settings)
+    _replace_run_by_checkpoint(settings.get("model") or {})
+    _convert_deskew(settings)
+    _check_settings(settings, complete=True)
     _refuse_deskew(settings)
     if (settings.get("model") or {}).get("apply", data.get("apply")) != data.get("apply"):
-        raise InputError("model.apply is that of the data, by which the floor is scored too; set data.apply")
-    shorten_if_wanted(settings)
-    place(settings.get("trainer") or {})
+        raise InputError(
+            "model.apply must be the same as data.apply, which is also used for the floor; set data.apply"
+        )
+    apply_fast_dev_run(settings)
+    check_devices(settings.get("trainer") or {})
     return settings
 
 
-def _check(settings: Settings, complete: bool) -> None:
-    """Compares the settings with their options; a model's have to be all there when they are complete."""
+def _check_settings(settings: Settings, complete: bool) -> None:
+    """Checks the settings against the options; if ``complete``, no option of the model may be missing."""
     data, model = settings.get("data") or {}, dict(settings.get("model") or {})
     check_options(Options, settings, "", partly=True)
     refuse_names(settings.get("trainer") or {})
@@ -153,47 +158,47 @@ def _check(settings: Settings, complete: bool) -> None:
     if name := data.get("reader", {}).get("format"):
         check_options(getattr(find_format(name), "Options", DataOptions), data, "data.", partly=True)
     if variant := str(model.pop("variant", "")):
-        from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
+        from rcnn_odom.models.contract import find_model  # Imports torch, which would make --help slow.
 
         check_options(find_model(variant).Options, model, "model.", partly=not complete)
-        settings["model"] |= model  # with the defaults of what was left out
+        settings["model"] |= model  # Now with the defaults of options that were left out.
 
 
-def _name_weights(model: Settings) -> None:
-    """Puts the checkpoint of a run in the place of its folder.
+def _replace_run_by_checkpoint(model: Settings) -> None:
+    """Replaces the folder of a run in ``pretrained`` by the path of its checkpoint.
 
     Raises:
-        InputError: as :func:`rcnn_odom.evaluation.run_folder.find_weights`.
+        InputError: see :func:`rcnn_odom.evaluation.run_folder.find_weights`.
     """
     if model.get("pretrained"):
         model["pretrained"] = str(find_weights(Path(model["pretrained"])))
     if isinstance(model.get("first_stage"), dict):
-        _name_weights(model["first_stage"])
+        _replace_run_by_checkpoint(model["first_stage"])
 
 
-def _name_deskew(settings: Settings) -> None:
-    """Makes words of ``deskew: on`` and ``off``, which are true and false to YAML."""
+def _convert_deskew(settings: Settings) -> None:
+    """Converts ``deskew: on`` and ``off`` back to text; YAML reads them as true and false."""
     data = settings.get("data") or {}
     if isinstance(data.get("deskew"), bool):
         data["deskew"] = "on" if data["deskew"] else "off"
 
 
 def _refuse_deskew(settings: Settings) -> None:
-    """Refuses ``data.deskew=on`` for models that look at depth vectors, as those of all runs do."""
+    """Refuses ``data.deskew=on`` for models that use depth vectors, which include all trained networks."""
     if (settings.get("data") or {}).get("deskew") != "on":
         return
-    from rcnn_odom.models.contract import find_model  # with torch, which would make --help slow
+    from rcnn_odom.models.contract import find_model  # Imports torch, which would make --help slow.
 
     variant = (settings.get("model") or {}).get("variant")
     if variant is None or getattr(find_model(variant), "uses_depth_vectors", True):
-        raise InputError("data.deskew=on: networks see scans as they were taken; set data.deskew=auto")
+        raise InputError("data.deskew=on: networks use scans without deskewing; set data.deskew=auto")
 
 
 def _check_data_names(data: Settings) -> None:
-    """Refuses an option of the data that nobody reads: neither this project nor the format of the recordings.
+    """Refuses an option of the data that neither this project nor the format of the recordings uses.
 
     Args:
-        data: options before they are resolved; the format's are those that ``data.reader`` refers to.
+        data: the options before interpolations are resolved; ``data.reader`` refers to those of the format.
     """
     form = str(data.get("reader", {}).get("format"))
     if "${" in form or form == "None":
@@ -206,15 +211,15 @@ def _check_data_names(data: Settings) -> None:
             raise InputError(f"data.{name}: there is no such option; there are {', '.join(sorted(known))}")
 
 
-def _name_paths(settings: Settings, prefix: str = "") -> None:
-    """Makes paths out of what looks like numbers, with the user's home for ``~``.
+def _convert_paths(settings: Settings, prefix: str = "") -> None:
+    """Converts the values of path options to text and replaces ``~`` by the user's home folder.
 
     Raises:
         InputError: a path is empty.
     """
     for key, value in settings.items():
         if isinstance(value, dict):
-            _name_paths(value, f"{prefix}{key}.")
+            _convert_paths(value, f"{prefix}{key}.")
         elif key in PATHS and value is not None:
             if not str(value).strip():
                 raise InputError(f"{prefix}{key}= is an empty path; give one, or leave it out")

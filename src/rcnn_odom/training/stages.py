@@ -1,4 +1,4 @@
-"""The steps of one training: a first stage where the model has one, then the model, then its scores."""
+"""The steps of a run: train the first stage if the model has one, train the model, score it."""
 
 import logging
 import pickle
@@ -30,33 +30,39 @@ from rcnn_odom.recordings.reference import MATCHER
 from rcnn_odom.recordings.trajectory import flatten
 from rcnn_odom.training.averaging import Averaging
 from rcnn_odom.training.checkpoint import calibrate, load_module, read_checkpoint
-from rcnn_odom.training.cluster import environment_of, find_world, has_joined, share
+from rcnn_odom.training.cluster import environment_of, find_world, has_joined, start_in_others
 from rcnn_odom.training.datamodule import OdometryDataModule
 from rcnn_odom.training.machine import resolve_precision
 from rcnn_odom.training.matcher_truth import MatcherTruth
 from rcnn_odom.training.modules import OdometryModule, module_for, steps_per_epoch
-from rcnn_odom.training.pretrained import begin_with, options_of_network, read_pretrained, warn_if_worse
+from rcnn_odom.training.pretrained import (
+    options_of_network,
+    read_pretrained,
+    start_from_pretrained,
+    warn_if_worse,
+)
 from rcnn_odom.training.processes import one_line_errors
+from rcnn_odom.training.run_card import describe_run, find_command
 from rcnn_odom.training.run_state import (
     Fingerprints,
     State,
     check_checkpoint,
-    entered,
     fingerprints,
-    point_latest,
+    link_latest,
+    open_run,
     state_of,
     write_json,
 )
 from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped, TimeUp
-from rcnn_odom.training.tensorboard import Layout, log_run
-from rcnn_odom.training.trainer_options import seconds_of
+from rcnn_odom.training.tensorboard import Dashboard, log_figure, log_results, log_run, log_start
+from rcnn_odom.training.trainer_options import max_time_in_seconds
 from rcnn_odom.training.training_log import TrainingLog
 
 log = logging.getLogger(__name__)
 
 
 def build_datamodule(settings: Settings) -> OdometryDataModule:
-    """The DataModule of a configuration; nothing has been read yet."""
+    """Builds the DataModule of a configuration; it does not read recordings yet."""
     data, model = settings["data"], settings["model"]
     cache = Path(settings["outputs"]) / "cache"
     recordings = open_recording(data["reader"])
@@ -80,12 +86,14 @@ def build_datamodule(settings: Settings) -> OdometryDataModule:
 
 
 def build_module(settings: Settings, datamodule: OdometryDataModule) -> OdometryModule:
-    """An untrained module for these data, its weights drawn from the seed."""
+    """Builds an untrained module for these data; its weights are drawn from the seed."""
     data, model = settings["data"], settings["model"]
     truths = [flatten(drive.camera_poses) for drive in datamodule.drives["val"]]
     lengths = list(fitting_lengths(truths, data["lengths"]))
     if lengths != data["lengths"]:
-        log.info("validation is too short for data.lengths: its drift is measured over %s m", lengths)
+        log.info(
+            "the validation drives are too short for data.lengths: their drift uses segments of %s m", lengths
+        )
     L.seed_everything(settings["seed"], verbose=False)
     module = module_for(model["variant"])(options_of_network(model), data["sensor"], lengths)
     module.set_units(datamodule.training_steps())
@@ -93,10 +101,15 @@ def build_module(settings: Settings, datamodule: OdometryDataModule) -> Odometry
 
 
 def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
-    """Lightning's Trainer for a run's folder; without one, a Trainer that can only test.
+    """Builds Lightning's Trainer.
+
+    Args:
+        settings: settings of the run.
+        run: folder of the run; None: the Trainer can only test.
 
     Raises:
-        InputError: the devices or the precision that were asked for are not to be had.
+        InputError: the requested devices or precision are not available, or the batch size is not a multiple
+            of the number of devices.
     """
     options = {name: value for name, value in settings["trainer"].items() if name != "max_time"}
     options["precision"] = resolve_precision(options["precision"], options["accelerator"])
@@ -104,7 +117,7 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
         raise InputError(
             f"trainer.devices={options['devices']}: several devices train by trainer=ddp trainer.devices=..."
         )
-    if find_world():  # what ddp_spawn would start is there
+    if find_world():  # torchrun or Slurm has already started what ddp_spawn would start.
         options["strategy"] = "ddp" if has_joined() else "auto"
     try:
         trainer = L.Trainer(
@@ -129,32 +142,34 @@ def build_trainer(settings: Settings, run: Path | None = None) -> L.Trainer:
 
 
 def _environment() -> ClusterEnvironment:
-    """Who starts processes: something else that has, or this one wherever it runs, also in a job of Slurm."""
+    """Lightning's environment: torchrun or Slurm if one has started the processes, else a local one."""
     world = find_world() if has_joined() else None
     return environment_of(world) if world else LightningEnvironment()
 
 
-def _builder(trainer: L.Trainer, settings: Settings) -> Callable[[], L.Trainer]:
-    """Builds a Trainer like this one in another process, whatever precision its own processor has."""
+def _trainer_builder(trainer: L.Trainer, settings: Settings) -> Callable[[], L.Trainer]:
+    """A picklable function that builds the same Trainer in another process, with the same precision."""
     options = settings["trainer"] | {"precision": trainer.precision}
     run = Path(settings["run_dir"]) if trainer.logger else None
     return partial(build_trainer, settings | {"trainer": options}, run)
 
 
 def _has_one_process(options: Settings) -> bool:
+    """Whether the options of the Trainer mean a single process."""
     devices = options["devices"]
     return "strategy" not in options and not (isinstance(devices, list) and len(devices) == 1)
 
 
 def _training_options(settings: Settings, run: Path) -> Settings:
+    """Options of the Trainer that only a training needs: logger, callbacks, number of epochs."""
     max_time = settings["trainer"].get("max_time")
-    saving = Saving(run / LAST, seconds_of(max_time) if max_time else None)
+    saving = Saving(run / LAST, max_time_in_seconds(max_time) if max_time else None)
     decay = settings["model"].get("averaging")
     return {
         "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
         "callbacks": [
             *([Averaging(decay)] if decay else []),
-            Layout(),
+            Dashboard(settings),
             TrainingLog(),
             Best(run / BEST),
             saving,
@@ -165,19 +180,20 @@ def _training_options(settings: Settings, run: Path) -> Settings:
 
 
 def train(settings: Settings, *, reuse: bool = False) -> Report | None:
-    """Everything that one run does; returns what its ``metrics.json`` holds.
-
-    None after ``trainer.max_time`` has stopped its first stage: the second cannot begin before the first is
-    whole, and so there is nothing to score.
+    """Trains and scores one run.
 
     Args:
-        settings: its configuration, plain.
-        reuse: as a sweep's job does, leave it at that where the run is finished already, and take the
-            weights of a finished run with the very same training.
+        settings: the configuration as plain values.
+        reuse: as in the jobs of a sweep: return the metrics of a run that is already finished, and take the
+            weights of another finished run with exactly the same training.
+
+    Returns:
+        The content of ``metrics.json``; None if ``trainer.max_time`` has stopped the first stage, since the
+        second stage needs a complete first stage.
 
     Raises:
-        InputError: see its message.
-        KeyboardInterrupt: stopped from the keyboard or by a signal; the log says how to go on.
+        InputError: the configuration, the run's folder or the recordings are invalid.
+        KeyboardInterrupt: the run was stopped by Ctrl-C or a signal; the log says how to continue.
     """
     run, outputs = home_of(Path(settings["run_dir"])), Path(settings["outputs"])
     settings, variant = settings | {"run_dir": str(run)}, settings["model"]["variant"]
@@ -186,25 +202,25 @@ def train(settings: Settings, *, reuse: bool = False) -> Report | None:
             f"model={variant} has nothing to train; score it: rcnn-odom evaluate model={variant} data=..."
         )
     if reuse and state_of(run, settings).state is State.FINISHED:
-        log.info("run %s is finished already", run)
+        log.info("run %s is already finished", run)
         return read_metrics_file(run)
-    read_pretrained(settings)  # what does not fit is told before recordings are encoded
+    read_pretrained(settings)  # An unsuitable checkpoint is refused before recordings are encoded.
     try:
         trainer = build_trainer(settings, run)
         datamodule = build_datamodule(settings)
-        with entered(run, settings):
+        with open_run(run, settings):
             datamodule.load()
-            point_latest(outputs, run)
+            link_latest(outputs, run)
             wanted = fingerprints(settings, datamodule)
             with one_at_a_time(outputs / "cache", wanted.settings, "training the same"):
                 metrics = train_module(settings, datamodule, trainer, wanted, reuse=reuse)
-    except (KeyboardInterrupt, SystemExit, Stopped):  # Lightning ends by the second after the first
-        log.error("stopped; the same command goes on from what is in %s", shlex.quote(str(run)))
+    except (KeyboardInterrupt, SystemExit, Stopped):  # Lightning turns KeyboardInterrupt into SystemExit.
+        log.error("stopped; the same command continues the run in %s", shlex.quote(str(run)))
         raise KeyboardInterrupt from None
-    except TimeUp:  # has been told
+    except TimeUp:  # The log already says so.
         return None
-    look = f"tensorboard --logdir {shlex.quote(settings['outputs'])}"
-    log.info("all of it is in %s; look at it with: %s", shlex.quote(str(run)), look)
+    viewer = f"tensorboard --logdir {shlex.quote(settings['outputs'])}"
+    log.info("all results are in %s; look at them with: %s", shlex.quote(str(run)), viewer)
     return metrics
 
 
@@ -216,23 +232,24 @@ def train_module(
     *,
     reuse: bool = False,
 ) -> Report:
-    """Trains one model, its first stage before it, and scores it on the test drives.
+    """Trains one model, with its first stage, and scores it on the test drives.
 
-    A run that was stopped or killed goes on from its last checkpoint, to the very same result on a CPU.
+    A run that was stopped or killed continues from its last checkpoint; on a CPU the result is exactly the
+    same.
 
     Args:
-        settings: of the run.
-        datamodule: its data, loaded.
-        trainer: for its folder.
+        settings: settings of the run.
+        datamodule: the data of the run, loaded.
+        trainer: Trainer for the run's folder.
         wanted: fingerprints of this training.
-        reuse: where another run among the outputs has finished the very same training (recordings,
-            network, recipe, seed and code), its weights are taken instead of training once more.
+        reuse: whether to take the weights of another run in ``outputs`` that has finished exactly the same
+            training (recordings, network, recipe, seed and code).
 
     Returns:
-        What ``metrics.json`` holds.
+        The content of ``metrics.json``.
 
     Raises:
-        TimeUp: the first stage has not been finished in ``trainer.max_time``.
+        TimeUp: the first stage was not finished within ``trainer.max_time``.
     """
     run = Path(settings["run_dir"])
     metrics: Report = {"fingerprint": wanted.settings, "code": wanted.code, "seed": settings["seed"]}
@@ -242,61 +259,68 @@ def train_module(
     else:
         metrics |= _fit(settings, datamodule, trainer, wanted)
     module = calibrate(run / BEST, datamodule.drives["val"])
+    assert isinstance(trainer.logger, TensorBoardLogger)
+    if found.state is State.TWIN:  # Nothing was trained, so the callback has not written the card.
+        card = describe_run(settings, find_command(), trainer, module, datamodule, metrics["same_as"])
+        log_start(trainer.logger, card)
     metrics |= {"variant": module.variant, "data": settings["data"]["name"]}
-    metrics |= score_module(module, datamodule, trainer, settings, run)
     training = metrics["training"]
+    metrics |= score_module(module, datamodule, trainer, settings, run, training["steps"])
+    log_results(trainer.logger, settings, metrics)
     if "stopped_by" not in training:
-        assert isinstance(trainer.logger, TensorBoardLogger)
-        log_run(trainer.logger, settings, metrics, training["steps"])
+        log_run(trainer.logger, settings, metrics)
     write_json(run / METRICS, metrics)
     if "stopped_by" in training:
         done = training["epochs"], settings["model"]["epochs"]
-        log.info("stopped by trainer.max_time after %d of %d epochs; the same command goes on", *done)
+        log.info("stopped by trainer.max_time after %d of %d epochs; the same command continues it", *done)
     else:
         (run / LAST).unlink(missing_ok=True)
     return metrics
 
 
 def _take_weights(twin: Path, run: Path) -> Report:
-    """Another run's best checkpoint, and what its ``metrics.json`` says of its training."""
+    """Copies the best checkpoint of another run; returns what its ``metrics.json`` says about training."""
     metrics = read_metrics_file(twin)
-    log.info("the same training has been done in %s; its weights are taken", twin)
+    log.info("run %s has finished the same training; its weights are used", twin)
     (run / BEST).parent.mkdir(parents=True, exist_ok=True)
     shutil.copyfile(twin / BEST, run / BEST)
-    told = ("pretrained", "first_stage", "training", "val")
-    kept: Report = {key: metrics[key] for key in told if key in metrics}
+    names = ("pretrained", "first_stage", "training", "val")
+    kept: Report = {key: metrics[key] for key in names if key in metrics}
     return kept | {"same_as": metrics.get("same_as", str(twin))}
 
 
 def _fit(
     settings: Settings, datamodule: OdometryDataModule, trainer: L.Trainer, wanted: Fingerprints
 ) -> Report:
-    """Trains, for as long as ``trainer.max_time`` allows; the part of ``metrics.json`` that is about it.
+    """Trains, at most for ``trainer.max_time``.
+
+    Returns:
+        The entries of ``metrics.json`` about training.
 
     Raises:
-        InputError: the checkpoint that it would go on from belongs to another training.
-        TimeUp: the first stage has not been finished.
+        InputError: the last checkpoint belongs to another training.
+        TimeUp: the first stage was not finished in time.
     """
-    run, begun = Path(settings["run_dir"]), time.monotonic()
+    run, start = Path(settings["run_dir"]), time.monotonic()
     last = run / LAST
     module = build_module(settings, datamodule)
     module.fingerprint, module.code = wanted
-    metrics = _begin_with_trained_weights(module, settings, datamodule)
+    metrics = _set_initial_weights(module, settings, datamodule)
     if last.exists():
         saved = read_checkpoint(last)
         check_checkpoint(last, saved, wanted)
-        log.info("going on from %s, step %d", last, saved["global_step"])
-        del saved  # its maps would keep the file's place on the disk
-    _saving_of(trainer).spent = time.monotonic() - begun
+        log.info("continuing from %s, step %d", last, saved["global_step"])
+        del saved  # Its memory maps would keep the space of the file on the disk.
+    _saving_of(trainer).spent = time.monotonic() - start
     stopped = {}
     try:
         with one_line_errors(trainer):
-            go_on: Settings = {"ckpt_path": last if last.exists() else None, "weights_only": True}
+            resume: Settings = {"ckpt_path": last if last.exists() else None, "weights_only": True}
             datamodule.trainer = trainer
-            _ = datamodule.batches_per_epoch  # refuses too few windows here, not in every process
+            _ = datamodule.batches_per_epoch  # Refuses too few windows here, not in every process.
             folders = [datamodule.cache_dir, run]
-            share(_builder(trainer, settings), "fit", module, datamodule, folders, **go_on)
-            trainer.fit(module, datamodule=datamodule, **go_on)
+            start_in_others(_trainer_builder(trainer, settings), "fit", module, datamodule, folders, **resume)
+            trainer.fit(module, datamodule=datamodule, **resume)
     except TimeUp:
         stopped = {"stopped_by": "trainer.max_time"}
     fitted = _read_fitted(run, steps_per_epoch(settings["trainer"].get("limit_train_batches"), datamodule))
@@ -308,10 +332,11 @@ def _fit(
 
 
 def _read_fitted(run: Path, steps_per_epoch: int) -> Report:
-    """How long a run was trained and its best validation, as its last checkpoint says.
+    """Reads the length of a training and its best validation drift from its last checkpoint.
 
-    Training in other processes has left it there too. A run that was stopped before its first validation has
-    no best weights yet, and gets its last ones for now: the first validation will choose others.
+    The checkpoint has them also if other processes have trained. A run that was stopped before its first
+    validation has no best checkpoint yet; it gets a copy of the last one, which the first validation
+    replaces.
     """
     saved = read_checkpoint(run / LAST)
     (best,) = (state for name, state in saved["callbacks"].items() if name.startswith("Best"))
@@ -329,28 +354,29 @@ def _read_fitted(run: Path, steps_per_epoch: int) -> Report:
 
 
 def _saving_of(trainer: L.Trainer) -> Saving:
+    """The callback of a Trainer that saves checkpoints."""
     (saving,) = (one for one in trainer.callbacks if isinstance(one, Saving))  # type: ignore[attr-defined]
     return saving
 
 
-def _begin_with_trained_weights(
+def _set_initial_weights(
     module: OdometryModule, settings: Settings, datamodule: OdometryDataModule
 ) -> Report:
-    """Gives a model the weights of ``model.pretrained``, or a trained first stage if it has one.
+    """Gives a model the weights of ``model.pretrained``, or those of a trained first stage.
 
     Returns:
-        The part of ``metrics.json`` about them.
+        The entries of ``metrics.json`` about them.
 
     Raises:
-        InputError: what was given does not fit.
-        TimeUp: the first stage has not been finished.
+        InputError: the given network does not fit.
+        TimeUp: the first stage was not finished in time.
     """
     model, variant = settings["model"], module.model.first_stage
     given = read_pretrained(settings)
     if given is not None and given.variant == module.variant:
-        # New worlds that the given network has not seen, nor its first stage.
+        # New worlds that neither the given network nor its first stage was trained on.
         datamodule.fresh_first = given.model.options["epochs"] + model.get("first_stage", {}).get("epochs", 0)
-        return begin_with(given, module, model["pretrained"], datamodule)
+        return start_from_pretrained(given, module, model["pretrained"], datamodule)
     if variant is None:
         return {}
     path = Path(model["pretrained"]) if given else _find_first_stage(settings, datamodule, variant)
@@ -360,16 +386,16 @@ def _begin_with_trained_weights(
         module.model.take_first_stage(stage.model)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    # An LSTM would otherwise learn from features of scans that their encoder was fitted to.
+    # Otherwise the LSTM would learn from features of scans that the encoder was trained on.
     datamodule.fresh_first = stage.model.options["epochs"]
     return {"first_stage": str(path)}
 
 
 def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, variant: str) -> Path:
-    """Checkpoint of the first stage: found among the runs, or trained now.
+    """Finds the checkpoint of the first stage among the runs, or trains it.
 
-    One that is found has the same recordings, network, recipe and seed, and was trained by the same code;
-    only the own one of a run that was stopped is kept whatever the code, and the log says so.
+    A first stage of another run is used if it has the same recordings, network, recipe, seed and code. A
+    first stage in this run's own folder is also used if the code has changed, and the log says so.
 
     Raises:
         TimeUp: ``trainer.max_time`` has stopped its training.
@@ -381,17 +407,19 @@ def _find_first_stage(settings: Settings, datamodule: OdometryDataModule, varian
     stage_data.drives = datamodule.drives
     wanted = fingerprints(settings, stage_data)
     with one_at_a_time(outputs / "cache", wanted.settings, "training the first stage"):
-        # The run's own comes first: it is there when the run was stopped after it.
+        # The run's own first stage is preferred. It exists if the run was stopped after it.
         found = state_of(run, settings, wanted, outputs)
         if found.state not in (State.FINISHED, State.TWIN):
-            log.info("first stage: no fitting %s in %s, training one", variant, outputs)
-            with entered(run, settings):
+            log.info("first stage: no suitable %s in %s, training one", variant, outputs)
+            with open_run(run, settings):
                 metrics = train_module(settings, stage_data, build_trainer(settings, run), wanted)
             if "stopped_by" in metrics["training"]:
-                log.info("the first stage is not whole, so that the second one has to wait")
+                log.info("the first stage is not finished, so the second one cannot start")
                 raise TimeUp
         elif read_metrics_file(found.run).get("code") != wanted.code:
-            log.info("the code has changed since the first stage of this run was trained; it is kept")
+            log.info(
+                "the code has changed since the first stage of this run was trained; it is used nevertheless"
+            )
     return found.run / BEST
 
 
@@ -401,27 +429,34 @@ def score_module(
     trainer: L.Trainer,
     settings: Settings,
     folder: Path,
+    step: int = 0,
 ) -> Report:
-    """Estimates the test drives with a network and scores it; a trainer's TensorBoard gets the figures.
+    """Scores a network on the test drives. The Trainer's TensorBoard logger, if any, gets the figures.
 
     Args:
-        module: with the network.
-        datamodule: with the test drives.
-        trainer: tests, perhaps in other processes.
-        settings: which the trainer was built with.
-        folder: see :func:`rcnn_odom.evaluation.run_report.report_drives`.
+        module: the trained module.
+        datamodule: has the test drives.
+        trainer: runs the test, possibly in other processes.
+        settings: settings with which the Trainer was built.
+        folder: gets the trajectories and figures.
+        step: number of training steps, for TensorBoard.
+
+    Returns:
+        See :func:`rcnn_odom.evaluation.run_report.report_drives`.
     """
     with TemporaryDirectory() as shared, one_line_errors(trainer):
-        # Other processes cannot hand their estimates over in memory.
+        # Other processes cannot return their estimates in memory.
         module.estimates_file = Path(shared) / "estimates" if trainer.world_size > 1 else None
         folders = [datamodule.cache_dir]
-        share(_builder(trainer, settings), "test", module, datamodule, folders, verbose=False)
+        start_in_others(
+            _trainer_builder(trainer, settings), "test", module, datamodule, folders, verbose=False
+        )
         trainer.test(module, datamodule=datamodule, verbose=False)
         if module.estimates_file:
             module.estimates = pickle.loads(module.estimates_file.read_bytes())
     mean_step, drives, logger = module.mean_step.double().numpy(), datamodule.drives["test"], trainer.logger
     latency = measure(module.model.stepper(), drives[0].scans)
-    add_figure = logger.experiment.add_figure if isinstance(logger, TensorBoardLogger) else None
+    add_figure = partial(log_figure, logger, step) if isinstance(logger, TensorBoardLogger) else None
     return report_drives(
         module.variant, module.estimates, mean_step, latency, drives, settings["data"], folder, add_figure
     )

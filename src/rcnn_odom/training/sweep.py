@@ -1,4 +1,4 @@
-"""Where the jobs of a sweep are, as told by the command that asked for them."""
+"""Names of the folders of a sweep's jobs, from the command that started the sweep."""
 
 import hashlib
 import re
@@ -11,18 +11,22 @@ from omegaconf.errors import OmegaConfBaseException
 
 LONGEST_NAME = 120
 SEPARATOR = "__"
-"""Between the overrides in a name: no comma, which Hydra would take for a sweep."""
+"""Separates the overrides in a name. It is not a comma, which Hydra would read as a sweep."""
 
 
 def folder_name(overrides: str) -> str:
-    """The name of a job's folder: its overrides, so that the same command finds it again.
+    """The name of a job's folder, made of its overrides, so that the same command finds the folder again.
 
     Args:
         overrides: ``hydra.job.override_dirname``, such as ``model-cnn_cls__seed-0``.
 
     Returns:
-        The same, what is told of the data and the trainer last. Characters that folders should not have are
-        replaced and long names cut; a hash then keeps apart what was different.
+        The overrides, with those of the data and the trainer last. Characters that are unsafe in a file name
+        are replaced, and long names are cut; such names get a hash, so that different overrides have
+        different names.
+
+    >>> folder_name("data-indoor__model-cnn_cls__seed-0")
+    'model-cnn_cls__seed-0__data-indoor'
     """
     pairs = sorted(overrides.split(SEPARATOR), key=lambda pair: (pair.startswith(("data", "trainer")), pair))
     wanted = SEPARATOR.join(pairs)
@@ -33,19 +37,19 @@ def folder_name(overrides: str) -> str:
 
 
 def expected_folders(sweep: Path) -> list[str] | None:
-    """Names of the folders of all jobs that the last command of a grid sweep asked for.
+    """Names of the folders of all jobs of a grid sweep, for its last command.
 
     Args:
-        sweep: its folder, with Hydra's ``multirun.yaml``.
+        sweep: folder of the sweep, with Hydra's ``multirun.yaml``.
 
     Returns:
-        None where that cannot be known: no such file, or a sweeper that draws its jobs.
+        None if they are unknown: there is no such file, or the sweeper draws its values at random.
     """
     from hydra._internal.core_plugins.basic_sweeper import BasicSweeper
 
     try:
         settings = OmegaConf.load(sweep / "multirun.yaml").hydra
-        if not settings.sweeper._target_.endswith(".BasicSweeper"):  # others draw values
+        if not settings.sweeper._target_.endswith(".BasicSweeper"):  # Other sweepers draw values.
             return None
         swept = [f"{key}={value}" for key, value in (settings.sweeper.params or {}).items()]
         overrides = OverridesParser.create().parse_overrides([*swept, *settings.overrides.task])

@@ -1,27 +1,64 @@
-"""TensorBoard as a dashboard: the layout of its custom scalars, and a run's row of its HParams tab."""
+"""What TensorBoard shows of a run: names of curves and figures, text cards, charts, the row in HParams."""
 
-from typing import Any
+import re
+from textwrap import fill
+from typing import TYPE_CHECKING, Any, cast
 
 import lightning as L
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
-from torch.utils.tensorboard.summary import hparams
+from torch.utils.tensorboard.summary import hparams, text
 
-from rcnn_odom.evaluation.metrics import all_metrics
+from rcnn_odom.evaluation.figures import new_figure
+from rcnn_odom.evaluation.metrics import DRIFT, Report, all_metrics
 from rcnn_odom.evaluation.run_folder import Settings, flat
+from rcnn_odom.training.modules import OdometryModule
+from rcnn_odom.training.run_card import describe_results, describe_run, find_command, segment_lengths
 
-LOSS_AND_DRIFT = {
-    "Loss": {
-        "loss": ["Multiline", ["train/loss_epoch"]],
-        "parts of the loss": ["Multiline", ["train/loss_.*_epoch"]],
-    },
-    "Drift (ratio)": {
-        "validation drift, the mean and each sequence": ["Multiline", ["val/drift.*"]],
-        "test drift, the mean and each sequence": ["Multiline", ["drift/test.*"]],
-    },
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+# TensorBoard sorts names and makes a group of those with the same text before the first slash. Names must not
+# have parentheses: Custom Scalars would draw no line, since it looks for a run's name in them.
+EACH_EPOCH = "Training: mean of each epoch/"
+EVERY_10_STEPS = "Training: every 10 steps/"
+VALIDATION = "Validation: after each epoch/"
+BEST_DRIFT = "Best checkpoint: drift/"
+BEST_OTHERS = "Best checkpoint: other test scores/"
+FIGURES = "Test of the best checkpoint/"
+"""Groups of scalars and figures."""
+ALL_DRIVES = "all drives"
+
+LEARNING_RATE = f"{EVERY_10_STEPS}learning rate"
+EPOCH = f"{EACH_EPOCH}number of the epoch, from 0"
+TEST_DRIFT = f"{BEST_DRIFT}test drift in %, {ALL_DRIVES}"
+VALIDATION_DRIFT = f"{BEST_DRIFT}validation drift in %, {ALL_DRIVES}"
+RUN_CARD, RESULTS_CARD = "About this run", "Test results"
+
+TITLES = {
+    "drift": "drift",
+    "r_err_deg_per_m": "rotational drift",
+    "rotation_deg_per_m": "rotational drift",
+    "distance_mae_m": "mean absolute distance error",
+    "distance_bias_m": "mean signed distance error",
+    "distance_max_m": "largest distance error",
+    "heading_mae_deg": "mean absolute heading error",
+    "heading_bias_deg": "mean signed heading error",
+    "heading_max_deg": "largest heading error",
 }
-"""Groups of charts by title, each with patterns of the scalars in it."""
+"""Names of the project's own metrics; other metrics are shown by their titles."""
+
+WITH_DRIVES = "drift", "r_err_deg_per_m"
+"""Validation scores that are also logged for each drive."""
+
+FIGURE_TITLES = {"trajectory": "estimated and true path", "motion": "rotation and translation of each frame"}
+"""Content of the figures of a single drive, by the end of the file's name."""
+WIDTH, HEIGHT, HEIGHT_OF_PANEL, DOTS_PER_INCH = 5.2, 4.5, 2.9, 180
+"""Width of a figure, its least height, and that of each of several panels, in inches. TensorBoard shows a
+figure about 350 pixels wide, so that the text of a larger one would be tiny."""
+TITLE_LETTERS = 46
+"""Maximum number of letters in a line of a figure's title."""
 
 NOT_IN_ROW = (
     "run_dir",
@@ -33,62 +70,255 @@ NOT_IN_ROW = (
     "data.keep_worlds",
     "trainer.max_time",
 )
+"""Settings that do not affect the result, or are shown under another name."""
 REPEATED = (
     *("model.apply", "model.first_stage.apply", "model.first_stage.kernel_size"),
     *("model.first_stage.pooling", "model.first_stage.rotation_classes"),
 )
-"""Settings that only repeat another one."""
+"""Settings that have the same value as another one."""
 
 CHOSEN_AS = {"model.variant": "model", "data.name": "data"}
-"""Settings whose column has the name of the choice on the command line, and so comes before its parts."""
+"""Settings whose column gets the name of the choice on the command line, to be sorted before its options."""
 
 
-class Layout(Callback):
-    """Tells TensorBoard which scalars belong together."""
+def training_tag(group: str, name: str) -> str:
+    """The name of a training curve in TensorBoard, from the model's name of the value.
+
+    >>> training_tag(EACH_EPOCH, "loss"), training_tag(EVERY_10_STEPS, "loss_rotation")
+    ('Training: mean of each epoch/loss', 'Training: every 10 steps/loss, part rotation')
+    """
+    words = name.removeprefix("loss_").replace("_", " ")
+    return f"{group}loss, part {words}" if name.startswith("loss_") else group + words
+
+
+def score_tag(group: str, metric: str, drive: str | None = None) -> str:
+    """The name of a score in TensorBoard, with its unit.
+
+    Args:
+        group: group of scalars.
+        metric: name of the metric in ``metrics.json``, or ``r_err_deg_per_m``.
+        drive: name of a drive, or ``ALL_DRIVES``; None if single drives have no such score.
+
+    >>> score_tag(VALIDATION, "drift", "10")
+    'Validation: after each epoch/drift in %, drive 10'
+    >>> score_tag(VALIDATION, "distance_mae_m")
+    'Validation: after each epoch/mean absolute distance error in m'
+    """
+    known = all_metrics()
+    title = TITLES.get(metric) or known[metric].title
+    unit = "deg/m" if metric == "r_err_deg_per_m" else known[metric].unit
+    place = "" if drive is None else f", {ALL_DRIVES if drive == ALL_DRIVES else f'drive {drive}'}"
+    return _without_parentheses(f"{group}{title}{f' in {unit}' if unit else ''}{place}")
+
+
+def _without_parentheses(tag: str) -> str:
+    """Replaces parentheses, for which Custom Scalars would draw no line."""
+    return tag.replace("(", "[").replace(")", "]")
+
+
+def validation_scalars(values: dict[str, float]) -> dict[str, float]:
+    """Values of ``trainer.callback_metrics`` by their names in TensorBoard, in the shown units.
+
+    >>> validation_scalars({"val/drift": 0.02})
+    {'Validation: after each epoch/drift in %, all drives': 2.0}
+    """
+    scalars, known = {}, all_metrics()
+    for key, value in values.items():
+        split, _, name = key.partition("/")
+        metric, _, drive = name.partition("/")
+        if split == "val":
+            scale = known[metric].scale if metric in known else 1.0
+            place = drive or (ALL_DRIVES if metric in WITH_DRIVES else None)
+            scalars[score_tag(VALIDATION, metric, place)] = scale * value
+    return scalars
+
+
+class Dashboard(Callback):
+    """Writes the text card of a run and the layout of the custom scalars when a training starts.
+
+    Args:
+        settings: settings of the run.
+    """
+
+    def __init__(self, settings: Settings) -> None:
+        self.settings = settings
+        # Processes that are started for training do not have Hydra's configuration.
+        self.command = find_command()
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Called once, before the first scalar."""
+        """Lightning's hook before the first step."""
         if not trainer.is_global_zero:
             return
         assert isinstance(trainer.logger, TensorBoardLogger)
-        writer = trainer.logger.experiment
-        others = {
-            f"{metric.title} ({name})": ["Multiline", [f"(val|test)/{name}"]]
-            for name, metric in all_metrics().items()
-            if metric.in_training and name != "drift"
-        }
-        writer.add_custom_scalars({**LOSS_AND_DRIFT, "Other metrics": others})
-        # A run that goes on, or begins again, will log what came after its last checkpoint once more.
+        # A resumed run logs the steps after its last checkpoint again. This event drops the older points.
         start = SessionLog(status=SessionLog.START)
-        writer.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
+        trainer.logger.experiment.file_writer.add_event(Event(step=trainer.global_step, session_log=start))
+        module = cast(OdometryModule, pl_module)
+        datamodule = trainer.datamodule  # type: ignore[attr-defined]
+        card = describe_run(self.settings, self.command, trainer, module, datamodule)
+        log_start(trainer.logger, card, trainer.global_step)
 
 
-def log_run(logger: TensorBoardLogger, settings: Settings, metrics: dict[str, Any], step: int) -> None:
-    """A finished run's row of the HParams tab: its settings, and drift as the metric; the scores as scalars.
-
-    No summary of an "experiment" is written, as Lightning would: the columns of the first run would stand for
-    those of all, in the order of the alphabet, and five are shown. Without it TensorBoard looks at all
-    runs, and shows first the settings in which they differ.
+def log_start(logger: TensorBoardLogger, card: str, step: int = 0) -> None:
+    """Writes the text card of a run and the layout of the custom scalars.
 
     Args:
-        logger: of the run.
-        settings: of the run.
-        metrics: with ``val`` and ``test`` of what ``metrics.json`` holds.
-        step: training steps that it took.
+        logger: logger of the run.
+        card: the result of :func:`rcnn_odom.training.run_card.describe_run`.
+        step: number of training steps so far.
+    """
+    logger.experiment.add_custom_scalars(custom_scalars())
+    log_text(logger, RUN_CARD, card, step)
+
+
+def custom_scalars() -> dict[str, dict[str, list[Any]]]:
+    """The charts of the tab Custom Scalars by group and title, with the patterns of their scalars."""
+
+    def chart(*patterns: str) -> list[Any]:
+        return ["Multiline", list(patterns)]
+
+    epoch, validation, best = re.escape(EACH_EPOCH), re.escape(VALIDATION), re.escape(BEST_DRIFT)
+    others = {
+        f"{TITLES.get(name, metric.title)} ({metric.unit})": chart(
+            re.escape(score_tag(VALIDATION, name)), re.escape(score_tag(BEST_OTHERS, name))
+        )
+        for name, metric in all_metrics().items()
+        if metric.in_training and name != DRIFT.name
+    }
+    return {
+        "Loss over training steps": {
+            "loss, mean of each epoch": chart(f"{epoch}loss$"),
+            "parts of the loss, mean of each epoch": chart(f"{epoch}loss, part"),
+        },
+        "Drift (%) over training steps": {
+            "validation: all drives and each of them": chart(f"{validation}drift in"),
+            "test of the best checkpoint": chart(f"{best}test"),
+        },
+        "Other scores over training steps": others,
+    }
+
+
+def log_text(logger: TensorBoardLogger, tag: str, markdown: str, step: int) -> None:
+    """Writes a text card; torch's ``add_text`` would append ``/text_summary`` to its name."""
+    summary = text(tag, markdown)
+    summary.value[0].tag = tag
+    logger.experiment.file_writer.add_summary(summary, step)
+
+
+def figure_tag(name: str) -> str:
+    """The name of a figure in TensorBoard, from the name of its file.
+
+    >>> figure_tag("test/05_trajectory")
+    'Test of the best checkpoint/drive 05: estimated and true path'
+    """
+    name = name.removeprefix("test/")
+    drive, _, kind = name.rpartition("_")
+    if drive and kind in FIGURE_TITLES:
+        return f"{FIGURES}drive {drive}: {FIGURE_TITLES[kind]}"
+    known = {"coverage": "errors within the estimated uncertainty"}
+    return f"{FIGURES}{ALL_DRIVES}: {known.get(name, name.replace('_', ' '))}"
+
+
+def log_figure(logger: TensorBoardLogger, step: int, name: str, figure: "Figure") -> None:
+    """Writes a figure, in a size at which its text is readable in TensorBoard.
+
+    Args:
+        logger: logger of the run.
+        step: number of training steps.
+        name: name of the figure's file.
+        figure: the figure; it is changed.
+    """
+    fit_figure(figure)
+    logger.experiment.add_figure(figure_tag(name), figure, step)
+
+
+def fit_figure(figure: "Figure") -> None:
+    """Changes the size of a figure and breaks its titles into lines, for TensorBoard."""
+    width, height = figure.get_size_inches()
+    figure.set_size_inches(WIDTH, max(HEIGHT, HEIGHT_OF_PANEL * len(figure.axes), WIDTH * height / width))
+    figure.set_dpi(DOTS_PER_INCH)
+    if title := figure.get_suptitle():
+        figure.suptitle(fill(title, TITLE_LETTERS))
+    for axes in figure.axes:
+        axes.set_title(fill(axes.get_title(), TITLE_LETTERS), fontsize="medium")
+
+
+def length_figure(name: str, test: Report) -> "Figure":
+    """Draws the drift over the length of the segments, with a line for each test drive.
+
+    Args:
+        name: name of the model.
+        test: the entry ``test`` of ``metrics.json``.
+    """
+    figure, axes = new_figure(WIDTH, HEIGHT)
+    lengths = segment_lengths(test)
+    for drive, scores in test["sequences"].items():
+        parts = scores["drift"]["per_length"]
+        shown = [each for each in lengths if each in parts]
+        axes.plot(
+            [float(each) for each in shown],
+            [DRIFT.scale * parts[each]["t_err"] for each in shown],
+            marker="o",
+            label=f"drive {drive}",
+        )
+    axes.set(title=f"{name}: test drift by length", xlabel="length of the segments (m)", ylabel="drift (%)")
+    axes.set_ylim(bottom=0)
+    axes.grid(alpha=0.3)
+    axes.legend()
+    return figure
+
+
+def log_results(logger: TensorBoardLogger, settings: Settings, metrics: Report) -> None:
+    """Writes the text card of the test scores and the figure of the drift by length.
+
+    Args:
+        logger: logger of the run.
+        settings: settings of the run.
+        metrics: content of ``metrics.json``.
+    """
+    step, test = metrics["training"]["steps"], metrics["test"]
+    log_text(logger, RESULTS_CARD, describe_results(settings, metrics), step)
+    if segment_lengths(test):
+        log_figure(logger, step, "test_drift_by_length", length_figure(metrics["variant"], test))
+
+
+def log_run(logger: TensorBoardLogger, settings: Settings, metrics: Report) -> None:
+    """Writes the row of a finished run in the HParams tab: settings and scores; also logs the scores.
+
+    Lightning also writes a summary of the "experiment". Then TensorBoard takes the columns from the first
+    run, in alphabetical order, and shows five of them. Without that summary it compares all runs and shows
+    the settings that differ first.
+
+    Args:
+        logger: logger of the run.
+        settings: settings of the run.
+        metrics: content of ``metrics.json``.
     """
     row = {
         CHOSEN_AS.get(name, name): value if type(value) in (int, float) else str(value)
         for name, value in flat(settings).items()
         if not name.startswith(NOT_IN_ROW + REPEATED)
     }
-    test = metrics["test"]
-    # Not val/drift, whose curve another point would purge; and TensorBoard sorts metrics by the alphabet.
-    scores = {"drift/validation": metrics["val"]["drift"], "drift/test": test["drift"]}
-    for name, scored in test["sequences"].items():
-        scores[f"drift/test/{name}"] = scored["drift"]["t_err"]
-    scores |= {f"test/{name}": value for name, value in test["metrics"].items() if name != "drift"}
-    known = {name: value for name, value in scores.items() if value is not None}
-    logger.log_metrics(known, step)
-    _, *summaries = hparams(row, known)
+    scores, step = best_scalars(metrics), metrics["training"]["steps"]
+    logger.log_metrics(scores, step)
+    _, *summaries = hparams(row, scores)
     for summary in summaries:
         logger.experiment.file_writer.add_summary(summary, step)
+
+
+def best_scalars(metrics: Report) -> dict[str, float]:
+    """The scores of the best checkpoint by their names in TensorBoard, in the shown units.
+
+    Args:
+        metrics: content of ``metrics.json``.
+    """
+    known, test = all_metrics(), metrics["test"]
+    # The validation drift has a name of its own, so that the validation curve gets no additional point.
+    scores = {VALIDATION_DRIFT: (DRIFT, metrics["val"]["drift"]), TEST_DRIFT: (DRIFT, test["drift"])}
+    for drive, scored in test["sequences"].items():
+        tag = _without_parentheses(f"{BEST_DRIFT}test drift in %, drive {drive}")
+        scores[tag] = DRIFT, scored["drift"]["t_err"]
+    for name, value in test["metrics"].items():
+        if name != DRIFT.name:
+            scores[score_tag(BEST_OTHERS, name)] = known[name], value
+    return {tag: metric.scale * value for tag, (metric, value) in scores.items() if value is not None}

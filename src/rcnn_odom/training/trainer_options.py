@@ -1,4 +1,4 @@
-"""Options of Lightning's Trainer: those that work here, and what to use in place of the others."""
+"""Options of Lightning's Trainer: those that are supported, and what to use instead of the others."""
 
 from dataclasses import dataclass, fields
 from datetime import timedelta
@@ -10,25 +10,24 @@ from rcnn_odom.options import option
 from rcnn_odom.training.cluster import World, find_world
 
 _VALIDATION = (
-    "validation runs over whole drives after every epoch, since the best checkpoint is chosen by it; "
-    "leave it out"
+    "validation uses whole drives after every epoch, since it chooses the best checkpoint; leave it out"
 )
-_EPOCHS = "the length of a training is one of the recipe; set model.epochs"
+_EPOCHS = "the length of a training belongs to the recipe; set model.epochs"
 _FOLDER = "a run writes into its own folder; set run_dir"
 _LOG = "TensorBoard gets a point every 10 steps and every epoch; leave it out"
-_CHECKPOINTS = "a training saves its last and its best checkpoint by itself; leave it out"
-_OWN = "this project's own are set in the code; leave it out"
+_CHECKPOINTS = "a training saves its last and its best checkpoint automatically; leave it out"
+_OWN = "the code of this project sets it; leave it out"
 
 INSTEAD = {
     **dict.fromkeys(
         ("limit_val_batches", "check_val_every_n_epoch", "val_check_interval", "num_sanity_val_steps"),
         _VALIDATION,
     ),
-    "limit_test_batches": "scores are those of whole drives; choose fewer drives, data.test=[...]",
-    "limit_predict_batches": "nothing is predicted beside the test; leave it out",
-    "overfit_batches": "choose what is learned and validated on; set data.train=[...] data.val=[...]",
+    "limit_test_batches": "whole drives are scored; choose fewer drives, data.test=[...]",
+    "limit_predict_batches": "there is no prediction apart from the test; leave it out",
+    "overfit_batches": "choose the training and validation drives; set data.train=[...] data.val=[...]",
     **dict.fromkeys(("max_epochs", "min_epochs", "max_steps", "min_steps"), _EPOCHS),
-    "accumulate_grad_batches": "a step is one batch, which the recipe counts by; set model.batch_size",
+    "accumulate_grad_batches": "a step of the recipe is one batch; set model.batch_size",
     "default_root_dir": _FOLDER,
     **dict.fromkeys(("logger", "log_every_n_steps", "enable_autolog_hparams", "model_registry"), _LOG),
     "enable_checkpointing": _CHECKPOINTS,
@@ -36,25 +35,25 @@ INSTEAD = {
     **dict.fromkeys(
         ("enable_progress_bar", "enable_model_summary"), "the log has a line for each epoch; leave it out"
     ),
-    "reload_dataloaders_every_n_epochs": "new drives come by data.fresh_worlds; leave it out",
+    "reload_dataloaders_every_n_epochs": "data.fresh_worlds gives new drives in every epoch; leave it out",
     **dict.fromkeys(
         ("profiler", "barebones"),
-        "speed is measured by make bench-train, or by a profiler around it; leave it out",
+        "make bench-train measures the speed, or use a profiler for the whole command; leave it out",
     ),
-    "inference_mode": "whole drives are scored without gradients; leave it out",
+    "inference_mode": "drives are always scored without gradients; leave it out",
 }
-"""Options of Lightning that are refused, each with what to use instead."""
+"""Refused options of Lightning, each with the reason and what to do instead."""
 
 ONLY_TRAINING = ("fast_dev_run", "limit_train_batches", "max_time")
-"""Options that mean nothing to ``evaluate.py``."""
+"""Options that have no meaning for ``evaluate.py``."""
 WITHOUT_EFFECT = ("max_time",)
-"""Options that do not decide what a training gives, once it has come to its end."""
+"""Options that do not change the result of a complete training."""
 
 
-def seconds_of(max_time: Any) -> float | None:
-    """``trainer.max_time`` in seconds; None where it has no meaning.
+def max_time_in_seconds(max_time: Any) -> float | None:
+    """Converts ``trainer.max_time`` to seconds; None if it is not valid.
 
-    >>> seconds_of("00:00:01:30"), seconds_of({"minutes": 2})
+    >>> max_time_in_seconds("00:00:01:30"), max_time_in_seconds({"minutes": 2})
     (90.0, 120.0)
     """
     if isinstance(max_time, str):
@@ -70,6 +69,7 @@ def seconds_of(max_time: Any) -> float | None:
 
 
 def _are_devices(devices: Any) -> bool:
+    """Whether this is a number of devices, a list of their numbers, or ``auto``."""
     if isinstance(devices, list):
         return bool(devices) and all(type(one) is int and one >= 0 for one in devices)
     return devices == "auto" if isinstance(devices, str) else bool(devices >= 1)
@@ -77,14 +77,15 @@ def _are_devices(devices: Any) -> bool:
 
 @dataclass(kw_only=True)
 class TrainerOptions:
-    """``trainer``: what may be set; fields with a default need a ``+`` on the command line."""
+    """The supported options ``trainer``; fields with a default need a ``+`` on the command line."""
 
     accelerator: str
     devices: int | str | list[Any] = option(  # noqa: RUF009
-        fits=_are_devices, wanted="a number of devices, 1 or more, or a list of theirs, for instance [0,1]"
+        fits=_are_devices,
+        wanted="a number of devices, 1 or more, or a list of device numbers, for instance [0,1]",
     )
     precision: str = option(choices=("auto", "bf16-mixed", "32-true"))
-    gradient_clip_val: float | None = option(above=0, wanted="null, which clips nothing, or a number above 0")
+    gradient_clip_val: float | None = option(above=0, wanted="null for no clipping, or a number above 0")
     gradient_clip_algorithm: str = option(default="norm", choices=("norm",))
     strategy: str = option(default="auto", choices=("auto", "ddp_spawn"))
     num_nodes: int | None = option(default=None, above=0)
@@ -100,13 +101,17 @@ class TrainerOptions:
     )
     max_time: str | dict[str, Any] | None = option(  # noqa: RUF009
         default=None,
-        fits=lambda max_time: seconds_of(max_time) is not None,
+        fits=lambda max_time: max_time_in_seconds(max_time) is not None,
         wanted="a time above 0, for instance 00:01:30:00 (days, hours, minutes, seconds) or {minutes: 90}",
     )
 
 
-def refusal(name: str) -> str | None:
-    """Why ``trainer.NAME`` cannot be set, one sentence; None if it can be."""
+def explain_refusal(name: str) -> str | None:
+    """Explains why the option ``trainer.NAME`` is not supported; None if it is.
+
+    >>> explain_refusal("accelerator") is None, explain_refusal("max_epochs")
+    (True, 'trainer.max_epochs: the length of a training belongs to the recipe; set model.epochs')
+    """
     known = sorted(each.name for each in fields(TrainerOptions))
     if name in known:
         return None
@@ -116,20 +121,20 @@ def refusal(name: str) -> str | None:
 
 
 def refuse_names(trainer: Settings) -> None:
-    """Looks at the names of all options of the Trainer.
+    """Checks the names of all options of the Trainer.
 
     Raises:
-        InputError: one has no meaning here.
+        InputError: an option is not supported.
     """
     for name in trainer:
-        if reason := refusal(str(name)):
+        if reason := explain_refusal(str(name)):
             raise InputError(reason)
 
 
-def shorten_if_wanted(settings: Settings) -> None:
-    """Replaces ``fast_dev_run`` by what it means: one epoch of so many batches, in each stage.
+def apply_fast_dev_run(settings: Settings) -> None:
+    """Replaces ``fast_dev_run`` by one epoch with that number of batches in each stage, in place.
 
-    So a run says in its configuration what was trained. What is null or false is left out.
+    So the saved configuration says what was trained. Options that are null or false are removed.
     """
     trainer, model = settings.get("trainer") or {}, settings.get("model") or {}
     batches = int(trainer.get("fast_dev_run") or 0)
@@ -145,19 +150,19 @@ def shorten_if_wanted(settings: Settings) -> None:
 
 
 def processes_per_node(default: int) -> int:
-    """How many processes torchrun or Slurm has started on each node; the default where they have not."""
+    """Number of processes that torchrun or Slurm has started on each node; otherwise the default."""
     try:
         world = find_world()
-    except InputError:  # will be told when the command begins
+    except InputError:  # The command reports the error later.
         return default
     return world.per_node if world else default
 
 
-def place(trainer: Settings) -> None:
-    """Compares devices and nodes with the processes that are there, and fills in ``num_nodes``.
+def check_devices(trainer: Settings) -> None:
+    """Compares the devices and nodes with the started processes, and sets ``num_nodes``.
 
     Raises:
-        InputError: they do not fit.
+        InputError: the numbers do not match.
     """
     world = find_world()
     if not trainer.get("num_nodes"):
@@ -168,22 +173,24 @@ def place(trainer: Settings) -> None:
         nodes = world.nodes
     elif nodes and nodes > 1:
         raise InputError(
-            f"trainer.num_nodes={nodes}: no process runs on other nodes; start the command on each of them "
-            "by torchrun or srun, or set trainer=ddp trainer.devices=... for one"
+            f"trainer.num_nodes={nodes}: no process runs on other nodes; start the command on each node by "
+            "torchrun or srun, or set trainer=ddp trainer.devices=... for one node"
         )
-    trainer.pop("num_nodes", None)  # one node is the same as none named
+    trainer.pop("num_nodes", None)  # One node is the default.
     if nodes and nodes > 1:
         trainer["num_nodes"] = nodes
 
 
 def _compare(world: World, devices: Any, nodes: int, strategy: str) -> None:
-    """Raises:
-    InputError: the processes of the world are not those of the Trainer.
+    """Compares the started processes with the options of the Trainer.
+
+    Raises:
+        InputError: they do not match.
     """
     if world.size > 1 and strategy == "auto":
         raise InputError(
-            f"trainer.strategy=auto: {world.starter} has started {world.size} processes; set trainer=ddp, "
-            "which lets them train together"
+            f"trainer.strategy=auto: {world.starter} has started {world.size} processes; set trainer=ddp "
+            "to train in all of them"
         )
     count = len(devices) if isinstance(devices, list) else devices
     if (count, nodes) != (world.per_node, world.nodes):
@@ -195,10 +202,10 @@ def _compare(world: World, devices: Any, nodes: int, strategy: str) -> None:
 
 
 def refuse_options_of_training(trainer: Settings) -> None:
-    """For a command that does not train.
+    """Checks the options of a command that does not train.
 
     Raises:
-        InputError: an option is one of training.
+        InputError: an option is only for training.
     """
     for name in ONLY_TRAINING:
         if name in trainer:

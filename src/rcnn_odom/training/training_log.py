@@ -1,4 +1,4 @@
-"""What a training logs: a line and a point on every curve for each epoch."""
+"""Logs a training: a line for each epoch, and the curves in TensorBoard."""
 
 import logging
 import sys
@@ -12,97 +12,113 @@ from lightning.pytorch.callbacks import Callback
 
 from rcnn_odom.evaluation.metrics import all_metrics
 from rcnn_odom.terminal import show_any_text
+from rcnn_odom.training.tensorboard import (
+    EACH_EPOCH,
+    EPOCH,
+    EVERY_10_STEPS,
+    LEARNING_RATE,
+    training_tag,
+    validation_scalars,
+)
 
 log = logging.getLogger(__name__)
-# Lightning logs facts about the machine and advertises products; this project logs what a user needs.
+# Lightning logs facts about the machine and advertisements, which users of this project do not need.
 for library in ("lightning.pytorch", "lightning.fabric"):
     logging.getLogger(library).setLevel(logging.WARNING)
     warnings.filterwarnings("ignore", module=library.replace(".", r"\."))
 
-EVERY = 10
-"""Steps from one point of a step's own curves to the next."""
+LOGGED_STEPS = 10
+"""Number of steps between two points of the curves of single steps."""
 
 
 class TrainingLog(Callback):
-    """Logs losses, their means over an epoch, the learning rate, and a line for each epoch.
+    """Logs losses and their means over an epoch, the learning rate, validation scores, and a line per epoch.
 
-    A progress bar would leave no line behind. The means are this project's own because Lightning's
-    forget the steps before a checkpoint: here an epoch that was interrupted has the same mean.
+    The lines stay in the log, which a progress bar does not. The means are not Lightning's, which lose the
+    steps before a checkpoint: here an interrupted and resumed epoch has the same mean.
 
     Attributes:
-        seconds: of training and validation up to the end of the last epoch, in all sittings.
+        seconds: duration of training and validation up to the end of the last epoch; an interrupted training
+            adds them up.
     """
 
     def __init__(self) -> None:
         self.seconds = 0.0
         self._sums: dict[str, float] = {}
         self._windows = 0
-        self._files: list[str] = []
+        self._log_files: list[str] = []
 
     def __getstate__(self) -> dict[str, Any]:
-        """Also tells a process that trains which files this one writes its messages to."""
+        """Adds the log files of this process, so that a process that trains writes to the same files."""
         handlers = logging.getLogger().handlers
         files = [handler.baseFilename for handler in handlers if isinstance(handler, logging.FileHandler)]
-        return self.__dict__ | {"_files": files}
+        return self.__dict__ | {"_log_files": files}
 
     def setup(self, trainer: L.Trainer, pl_module: L.LightningModule, stage: str) -> None:
-        """In a process that only trains, lets the first one speak."""
+        """Sets up logging in the first of the processes that were started for training."""
         if trainer.is_global_zero and not logging.getLogger().handlers:
             show_any_text()
             logging.basicConfig(level=logging.INFO, format="%(message)s", stream=sys.stdout)
-            for file in self._files:
+            for file in self._log_files:
                 logging.getLogger().addHandler(
                     logging.FileHandler(file, encoding="utf-8", errors="backslashreplace")
                 )
 
     def on_train_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Starts the clock."""
-        self._begun = time.monotonic() - self.seconds
+        """Starts to measure the time."""
+        self._start = time.monotonic() - self.seconds
 
     def on_train_epoch_start(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Begins the means; not called where an interrupted epoch goes on."""
+        """Resets the means; Lightning does not call this when an interrupted epoch continues."""
         self._sums, self._windows = {}, 0
 
     def on_train_batch_start(
         self, trainer: L.Trainer, pl_module: L.LightningModule, batch: Any, batch_idx: int
     ) -> None:
-        """Remembers the learning rate of the step, which moves on with it."""
+        """Keeps the learning rate of this step, which the schedule changes after it."""
         self._rate = trainer.optimizers[0].param_groups[0]["lr"]
 
     def on_train_batch_end(
         self, trainer: L.Trainer, pl_module: L.LightningModule, outputs: Any, batch: Any, batch_idx: int
     ) -> None:
-        """Adds what ``training_step`` returns, scalars by name, to the means; logs every tenth step."""
+        """Adds the scalars of ``training_step`` to the means, and logs those of every tenth step."""
         values = {name: float(value.detach()) for name, value in outputs.items()}
         windows = len(batch["steps"])
         self._windows += windows
         for name, value in values.items():
             self._sums[name] = self._sums.get(name, 0.0) + windows * value
         assert trainer.logger is not None
-        if trainer.global_step % EVERY == 0:
-            points = {f"train/{name}_step": value for name, value in values.items()}
-            trainer.logger.log_metrics({"train/learning_rate": self._rate, **points}, trainer.global_step - 1)
+        if trainer.global_step % LOGGED_STEPS == 0:
+            points = {training_tag(EVERY_10_STEPS, name): value for name, value in values.items()}
+            trainer.logger.log_metrics({LEARNING_RATE: self._rate, **points}, trainer.global_step - 1)
+
+    def on_validation_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
+        """Adds the validation scores to their curves."""
+        if trainer.logger is not None:
+            values = {name: float(value) for name, value in trainer.callback_metrics.items()}
+            trainer.logger.log_metrics(validation_scalars(values), trainer.global_step - 1)
 
     def on_train_epoch_end(self, trainer: L.Trainer, pl_module: L.LightningModule) -> None:
-        """Called after the epoch's validation."""
-        self.seconds = time.monotonic() - self._begun
+        """Logs the means of the epoch; called after its validation."""
+        self.seconds = time.monotonic() - self._start
         sums, windows = self._sums_of_all_processes(trainer)
         means = {name: total / windows for name, total in sums.items()}
-        points = {f"train/{name}_epoch": mean for name, mean in means.items()}
+        points = {training_tag(EACH_EPOCH, name): mean for name, mean in means.items()}
         assert trainer.logger is not None
-        trainer.logger.log_metrics({"epoch": trainer.current_epoch, **points}, trainer.global_step - 1)
+        trainer.logger.log_metrics({EPOCH: trainer.current_epoch, **points}, trainer.global_step - 1)
         self._log_line(trainer, means["loss"])
 
     def _sums_of_all_processes(self, trainer: L.Trainer) -> tuple[dict[str, float], float]:
-        """Sums and windows of the epoch so far."""
+        """Sums of the scalars by name, and the number of windows, of the epoch so far."""
         names = sorted(self._sums)
-        here = torch.tensor([*(self._sums[name] for name in names), self._windows], dtype=torch.float64)
+        own = torch.tensor([*(self._sums[name] for name in names), self._windows], dtype=torch.float64)
         *sums, windows = trainer.strategy.reduce(
-            here.to(trainer.strategy.root_device), reduce_op="sum"
+            own.to(trainer.strategy.root_device), reduce_op="sum"
         ).tolist()
         return dict(zip(names, sums, strict=True)), windows
 
     def _log_line(self, trainer: L.Trainer, loss: float) -> None:
+        """Logs the line of an epoch."""
         values = {name: float(value) for name, value in trainer.callback_metrics.items()}
         shown = ", ".join(
             f"{metric.title} {metric.show(values.get(f'val/{name}'))} {metric.unit}"
@@ -117,16 +133,16 @@ class TrainingLog(Callback):
     def on_save_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Keeps the clock and the means so far."""
+        """Saves the time and the sums so far."""
         sums, windows = self._sums_of_all_processes(trainer)
-        seconds = time.monotonic() - self._begun
+        seconds = time.monotonic() - self._start
         checkpoint["training_log"] = {"seconds": seconds, "sums": sums, "windows": windows}
 
     def on_load_checkpoint(
         self, trainer: L.Trainer, pl_module: L.LightningModule, checkpoint: dict[str, Any]
     ) -> None:
-        """Goes on from a checkpoint's; the sums of all processes are then one's."""
-        kept = checkpoint["training_log"]
-        self.seconds = kept["seconds"]
-        self._sums = {name: total * trainer.is_global_zero for name, total in kept["sums"].items()}
-        self._windows = kept["windows"] * trainer.is_global_zero
+        """Restores the time and the sums; the first process gets the sums of all processes."""
+        saved = checkpoint["training_log"]
+        self.seconds = saved["seconds"]
+        self._sums = {name: total * trainer.is_global_zero for name, total in saved["sums"].items()}
+        self._windows = saved["windows"] * trainer.is_global_zero

@@ -1,4 +1,4 @@
-"""Training windows: consecutive pairs of scans, and in which order they are drawn."""
+"""Training windows of consecutive pairs of scans, and the order in which they are drawn."""
 
 import math
 from collections.abc import Iterator
@@ -17,17 +17,17 @@ from rcnn_odom.training.augmentation import Augmentation
 from rcnn_odom.training.fresh_worlds import FreshWorlds
 
 Draw = tuple[int, int, bool]
-"""What the sampler decides about a window: its first frame, a seed for its augmentation, mirrored or not."""
+"""The sampler's choice for a window: first frame, seed of the augmentation, and whether it is mirrored."""
 
 
 class Windows(Dataset):
-    """Windows of consecutive pairs of scans out of drives laid end to end.
+    """Windows of consecutive pairs of scans. Frames are numbered through all drives.
 
     Args:
-        drives: to draw from.
-        sensor: theirs.
-        length: pairs in a window; 1 gives the CNNs their single pairs.
-        augmentation: what happens to them; None: nothing.
+        drives: the drives to draw windows from.
+        sensor: the sensor of their scans.
+        length: pairs in a window; 1 for the CNNs.
+        augmentation: changes of the windows; None: no change.
     """
 
     def __init__(
@@ -38,11 +38,11 @@ class Windows(Dataset):
         self.first_frames = np.cumsum([0] + [len(drive) for drive in drives])
 
     def __getitems__(self, draws: list[Draw]) -> Batch:
-        """A batch of windows.
+        """Builds a batch of windows.
 
         Returns:
             ``pairs`` (B, T, 2, bins) in metres, ``steps`` (B, T, 3) in metres and radians, and ``frames``
-            (B,), where the windows begin, of all drives laid end to end.
+            (B,), the first frames of the windows, numbered through all drives.
         """
         pairs = np.empty((len(draws), self.length, 2, self.sensor.bins), np.float32)
         steps = np.empty((len(draws), self.length, 3), np.float32)
@@ -55,15 +55,15 @@ class Windows(Dataset):
         }
 
     def describe(self, frames: list[int]) -> str:
-        """Which frames of which drives the windows that begin at these frames show, in words."""
+        """Names the drives and frames of the windows that begin at these frames, for a message."""
         ranges: dict[str, list[str]] = {}
         for frame in sorted(frames):
             drive, start = self._locate(frame)
             ranges.setdefault(drive.name, []).append(f"{start}-{start + self.length}")
-        return "; ".join(f"{name}: {' '.join(its)}" for name, its in ranges.items())
+        return "; ".join(f"{name}: {' '.join(frames_of_drive)}" for name, frames_of_drive in ranges.items())
 
     def _locate(self, frame: int) -> tuple[Drive, int]:
-        """The drive that holds a frame of all, and the frame's place in it."""
+        """The drive of a frame that is numbered through all drives, and the frame's number in that drive."""
         number = int(np.searchsorted(self.first_frames, frame, side="right")) - 1
         return self.drives[number], frame - int(self.first_frames[number])
 
@@ -75,19 +75,19 @@ class Windows(Dataset):
         seed: int,
         mirror: bool,
     ) -> None:
-        """Fills in pairs (T, 2, bins) and steps (T, 3) of one window."""
+        """Writes one window into ``pairs`` (T, 2, bins) and ``steps`` (T, 3), in place."""
         drive, start = self._locate(frame)
         stop, augmentation = start + self.length, self.augmentation
         scans, truth = drive.scans[start : stop + 1], drive.steps[start:stop]
-        if augmentation.is_of_scans:
+        if augmentation.changes_scans:
             scans, truth = augmentation.change(scans, truth, seed)
         pairs[:, 0], pairs[:, 1] = scans[:-1], scans[1:]
         steps[:] = truth
-        if most := augmentation.max_turn_bins:
-            turns = np.random.default_rng(seed).integers(-most, most, self.length, endpoint=True)
+        if max_turn := augmentation.max_turn_bins:
+            turns = np.random.default_rng(seed).integers(-max_turn, max_turn, self.length, endpoint=True)
             for pair, turn in zip(pairs, turns, strict=True):
                 pair[1] = turn_scan(pair[1], int(turn), self.sensor)
-            # A turn on the spot after the step: where the laser is stays as it was.
+            # The laser turns on the spot after the step, so its position does not change.
             steps[:, 2] += turns * math.radians(self.sensor.resolution_deg)
         if mirror:
             pairs[:] = pairs[..., ::-1]
@@ -95,9 +95,13 @@ class Windows(Dataset):
 
 
 def turn_scan(scan: npt.NDArray[np.float32], bins: int, sensor: Sensor) -> npt.NDArray[np.float32]:
-    """The depth vector (bins,) as seen by a laser turned left by whole bins.
+    """The depth vector (bins,) of a laser that is turned left by whole bins.
 
-    What turns out of a partial field of view is lost, and what turns into it is empty.
+    In a partial field of view, returns that leave it are lost, and bins that enter it are empty.
+
+    >>> sensor = Sensor(resolution_deg=90.0, field_of_view_deg=180.0)
+    >>> turn_scan(np.array([1.0, 2.0, 3.0], np.float32), 1, sensor).tolist()
+    [2.0, 3.0, 0.0]
     """
     if sensor.field_of_view_deg == 360:
         turned = np.roll(scan[:-1], -bins)
@@ -109,14 +113,18 @@ def turn_scan(scan: npt.NDArray[np.float32], bins: int, sensor: Sensor) -> npt.N
 
 
 class WindowSampler(Sampler[Draw]):
-    """Every epoch cuts each drive into windows from another random frame on, and shuffles them.
+    """Cuts each drive into windows and shuffles them.
 
-    All draws come from (seed, epoch), so that an epoch is the same however it was reached.
+    The first window of a drive begins at another random frame in every epoch. All random numbers depend on
+    the seed and the epoch only. So an epoch of a resumed training is the same.
 
     Args:
-        lengths: frames of each drive. window: pairs in a window. mirror: mirror every other window.
-        stride: frames between the beginnings of windows; None: the window's length, so that none overlap.
-        repeat: how often each window comes in an epoch, each time augmented in another way.
+        lengths: number of frames of each drive.
+        window: pairs in a window.
+        mirror: whether half of the windows are mirrored.
+        seed: seed of the random numbers.
+        stride: frames between the beginnings of windows; None: the length of a window, so that none overlap.
+        repeat: how often each window is drawn in an epoch, each time with another augmentation.
     """
 
     def __init__(
@@ -130,8 +138,8 @@ class WindowSampler(Sampler[Draw]):
     ) -> None:
         self.lengths, self.window, self.mirror, self.seed = lengths, window, mirror, seed
         self.stride, self.repeat = stride or window, repeat
-        # Of the frames at which a window can begin, each stride has one; what is left over is the room by
-        # which the first window moves, so that every pair has its turn.
+        # The first window begins at a random frame within the frames that the strides leave over. So all
+        # pairs are used over the epochs.
         self.counts = [max(1, (length - window) // self.stride) for length in lengths]
         self.epoch = 0
 
@@ -155,11 +163,12 @@ class WindowSampler(Sampler[Draw]):
 
 
 class FreshSampler(WindowSampler):
-    """Draws windows out of other drives in every epoch, as long as the first epoch's.
+    """Draws windows from new drives in every epoch. Their lengths are those of the first epoch's drives.
 
     Args:
-        windows: of the first epoch's drives. worlds: the drives of every epoch.
-        mirror, seed, stride, repeat: as for :class:`WindowSampler`.
+        windows: windows of the first epoch's drives; later epochs replace the drives in it.
+        worlds: the drives of every epoch.
+        mirror, seed, stride, repeat: see :class:`WindowSampler`.
     """
 
     def __init__(
@@ -176,31 +185,34 @@ class FreshSampler(WindowSampler):
         self.windows, self.worlds = windows, worlds
 
     def set_epoch(self, epoch: int) -> None:
-        """Lightning calls this before each epoch, of a resumed run as well."""
+        """Lightning calls this before each epoch, also in a resumed run."""
         super().set_epoch(epoch)
-        # Lightning tells only samplers of an epoch; the loader has no processes that would hold a copy.
+        # Lightning passes the epoch to samplers only. The loader has no worker processes with copies of the
+        # windows.
         self.windows.drives = self.worlds.drives_of(epoch)
 
 
 class Batches(Sampler[list[Draw]]):
-    """Whole batches of draws, of which every process takes its share; an epoch can go on where it stopped.
+    """Batches of draws, shared evenly among processes. An interrupted epoch can continue at its next batch.
 
     Args:
-        sampler: of the draws. batch_size: windows in a batch, of all processes together.
-        rank: number of this process. processes: how many there are; they divide ``batch_size``.
+        sampler: gives the draws.
+        batch_size: windows in a batch of all processes together.
+        rank: number of this process.
+        processes: number of processes; it divides ``batch_size``.
 
     Attributes:
-        given: batches of the present epoch that have been given away.
+        given: number of batches of the present epoch that have been drawn.
     """
 
     def __init__(self, sampler: WindowSampler, batch_size: int, rank: int = 0, processes: int = 1) -> None:
-        # Lightning tells `sampler` of every epoch.
+        # Lightning calls `set_epoch` of the attribute `sampler`.
         self.sampler, self.batch_size, self.rank, self.processes = sampler, batch_size, rank, processes
         self.given = 0
         self._skipped = 0
 
-    def go_on_after(self, batches: int) -> None:
-        """Lets the next epoch that is asked for begin with a later batch."""
+    def skip_batches(self, batches: int) -> None:
+        """Lets the next iteration skip this number of batches."""
         self._skipped = batches
 
     def __len__(self) -> int:
@@ -215,17 +227,18 @@ class Batches(Sampler[list[Draw]]):
 
 
 class TrainingLoader(DataLoader):
-    """A DataLoader that tells a checkpoint how far it has come.
+    """A DataLoader whose position within an epoch is saved in checkpoints.
 
-    Torchdata's would draw the batches to skip before Lightning has set the sampler's epoch.
+    Torchdata's loader does not fit: it draws the skipped batches before Lightning has set the sampler's
+    epoch.
     """
 
     batch_sampler: Batches
 
     def state_dict(self) -> dict[str, int]:
-        """What a checkpoint keeps."""
+        """The position, for a checkpoint."""
         return {"batches": self.batch_sampler.given}
 
     def load_state_dict(self, state_dict: dict[str, int]) -> None:
-        """Goes on from a checkpoint's."""
-        self.batch_sampler.go_on_after(state_dict["batches"])
+        """Continues at the position of a checkpoint."""
+        self.batch_sampler.skip_batches(state_dict["batches"])

@@ -31,7 +31,7 @@ from data.make_bag import (
 from data.make_carmen import make_carmen
 from rcnn_odom.errors import InputError
 from rcnn_odom.recordings import rosbag
-from rcnn_odom.recordings.bags.chunks import BrokenBag, _unpack, in_order
+from rcnn_odom.recordings.bags.chunks import BrokenBag, _unpack, sort_messages
 from rcnn_odom.recordings.formats import open_stream
 
 RANGES = np.random.default_rng(0).uniform(1, 39, (40, 181))
@@ -93,7 +93,7 @@ def test_packed_bags_are_unpacked_and_removed(tmp_path, monkeypatch, kind, packi
         (bytes(5000), "is named like a ROS bag, but begins with"),
         (b"version https://git-lfs.github.com/spec/v1\noid sha256:0", "is a pointer of Git LFS"),
         (b"PK\x03\x04 and so on", "is a zip archive; "),
-        (b"#ROSBAG V1.2\n", "before version 2.0 of the format .*; rewrite it by ROS 1's 'rosbag filter"),
+        (b"#ROSBAG V1.2\n", "a format before version 2.0 .*; convert it with ROS 1's 'rosbag filter"),
         (b"\x89MCAP0\r\n", "cannot be opened as a ROS bag .*; .* 'mcap recover'"),
         (b"#ROSBAG V2.0\n", "cannot be opened as a ROS bag .*; .* 'rosbag reindex'"),
         (b"SQLite format 3\0", "cannot be opened as a ROS bag .*; "),
@@ -188,7 +188,7 @@ def test_the_files_that_are_read_are_told(tmp_path, kind):
     names = ", ".join(f"split_{number}{suffix}" for number in (0, 1, 2, 10))
     assert open_stream(bag).notes == ("40 scans of /scan", f"4 files: {names}")
     (bag / "metadata.yaml").write_bytes(b"\xff garbage")
-    garbage = f"metadata.yaml names no files that can be read; what is there is read: {names}"
+    garbage = f"metadata.yaml names no files that can be read; files in the folder are read: {names}"
     assert open_stream(bag).notes == ("40 scans of /scan", garbage)
     write_metadata(bag, [f"split_2{suffix}"])
     assert open_stream(bag).notes == ("10 scans of /scan",)
@@ -247,7 +247,7 @@ def test_another_database_is_no_bag(tmp_path, name, table):
     with closing(sqlite3.connect(tmp_path / name)) as database, database:
         database.execute(f"CREATE TABLE {table}")
     with pytest.raises(
-        InputError, match=r"is a database of sqlite3, but no ROS bag \(no such .*; give"
+        InputError, match=r"is a database of sqlite3, but not a ROS bag \(no such .*; give"
     ) as told:
         open_stream(tmp_path / name)
     assert "reindex" not in str(told.value)
@@ -319,7 +319,7 @@ def test_chunks_that_do_not_overlap_are_not_held_in_memory():
         opened.append(number)
         return [(10 * number + i, 0, memoryview(b"")) for i in (3, 1)]
 
-    messages = in_order((10 * number, lambda number=number: chunk(number)) for number in (2, 0, 1))
+    messages = sort_messages((10 * number, lambda number=number: chunk(number)) for number in (2, 0, 1))
     assert [next(messages)[0] for _ in range(3)] == [1, 3, 11]
     assert opened == [0, 1]
 
@@ -327,7 +327,7 @@ def test_chunks_that_do_not_overlap_are_not_held_in_memory():
         yield 5, 0, memoryview(b"")
         raise BrokenBag("it ends")
 
-    messages = in_order([(0, broken), (10, lambda: chunk(1))])
+    messages = sort_messages([(0, broken), (10, lambda: chunk(1))])
     assert next(messages)[0] == 5
     with pytest.raises(BrokenBag):
         next(messages)
@@ -342,7 +342,7 @@ def test_mcap_that_is_cut_off_gives_what_is_there(tmp_path, packing, part):
     path.write_bytes(path.read_bytes()[: int(part * path.stat().st_size)])
     stream, scans = open_stream(path), []
     with pytest.raises(
-        InputError, match=r"breaks off after .* scans .*; what came before is kept; .*mcap recover"
+        InputError, match=r"breaks off after .* scans .*; these scans are kept; .*mcap recover"
     ):
         scans.extend(stream.scans)
     assert (part - 0.25) * 100 < len(scans) <= part * 100 + 1
@@ -394,7 +394,7 @@ def test_a_damaged_chunk_is_not_believed(tmp_path):
     content[len(content) // 2] ^= 0x10
     path.write_bytes(content)
     with pytest.raises(
-        InputError, match=r"breaks off after 2\d scans .a chunk of it is damaged, as its checksum"
+        InputError, match=r"breaks off after 2\d scans .a chunk of it is damaged: its checksum"
     ):
         read(path)
 

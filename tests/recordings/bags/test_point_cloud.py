@@ -132,7 +132,7 @@ def test_without_rings_points_are_cut_by_elevation(tmp_path, ring_of_all):
         check_ring(scan, number, LEVEL_RING)
     assert "the beam at +1.00 degrees" in stream.notes[1]
     with pytest.raises(
-        InputError, match="do not say rings; leave the ring out, or cut at a height with --height"
+        InputError, match="its points have no rings; leave the ring out, or cut at a height with --height"
     ):
         read(bag, ring=3)
 

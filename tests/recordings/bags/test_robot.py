@@ -88,7 +88,9 @@ def test_wheel_poses_lie_between_the_messages(tmp_path, kind):
     np.testing.assert_allclose(np.sin(found[:, 2] - expected[:, 2]), 0, atol=1e-5)
     np.testing.assert_allclose([scan.ranges for scan in scans], RANGES, rtol=1e-6)
     note = stream.notes[-1]
-    assert note.startswith("wheel odometry: 31 poses of /odom, taken as the laser's own: there is no /tf_st")
+    assert note.startswith(
+        "wheel odometry: 31 poses of /odom, taken as the laser's own: the bag has no /tf_st"
+    )
     assert stream.laser_pose is None
 
 
@@ -146,7 +148,7 @@ def test_odometry_that_is_not_there(tmp_path):
     with pytest.raises(InputError, match="no topic odom; it has none with nav_msgs/msg/Odometry, or leave"):
         open_stream(write(tmp_path / "none", "mcap"), {"odom_topic": "odom"})
     (tmp_path / "empty").mkdir()
-    with pytest.raises(InputError, match="no pose can be read of /odom; choose another topic"):
+    with pytest.raises(InputError, match="no pose of /odom can be read; choose another topic"):
         open_stream(write(tmp_path / "empty", "mcap", odom=[]), {"odom_topic": "odom"})
 
 
@@ -178,7 +180,7 @@ def test_scans_in_the_frame_of_the_base_need_no_transforms(tmp_path):
 @pytest.mark.parametrize(
     ("transforms", "base", "says"),
     [
-        (None, "base_link", "there is no /tf_static in it, which would say where the laser sits; "),
+        (None, "base_link", "the bag has no /tf_static, so the pose of the laser on the robot is unknown; "),
         (MOUNT, "base", "/tf_static has no frame base, only base_link, laser, plate; correct --base, or say"),
         ({("base_link", "camera"): (0,) * 6}, "base_link", "has no frame laser, only base_link, camera; "),
         (MOUNT | {("map", "arm"): (0,) * 6}, "arm", "/tf_static does not connect arm with laser; "),
@@ -188,7 +190,7 @@ def test_scans_in_the_frame_of_the_base_need_no_transforms(tmp_path):
             "laser is not mounted level on b: it is tilted by 20 de",
         ),
         ({("b", "laser"): (0, 0, 1, 90, 0, 0)}, "b", "it is tilted by 90 degrees; correct --base, or say"),
-        ({("b", "laser"): (0,) * 6, ("laser", "b"): (0,) * 6}, "b", "go round in a ring, by way of b; "),
+        ({("b", "laser"): (0,) * 6, ("laser", "b"): (0,) * 6}, "b", "form a loop through b; "),
     ],
 )
 def test_transforms_that_do_not_tell(tmp_path, transforms, base, says):
@@ -217,7 +219,9 @@ def test_a_transform_without_a_rotation_does_not_tell(tmp_path):
     bag = write_bag(
         tmp_path, "mcap", topics, [("/tf_static", arrival_of(0), message), ("/scan", arrival_of(1), scan)]
     )
-    with pytest.raises(InputError, match="/tf_static holds no rotation between b and laser; correct --base"):
+    with pytest.raises(
+        InputError, match="/tf_static has no valid rotation between b and laser; correct --base"
+    ):
         open_stream(bag, {"base": "b"})
 
 

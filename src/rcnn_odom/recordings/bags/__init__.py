@@ -1,1 +1,1 @@
-"""What a ROS bag holds: its files, their messages, the choice of a topic, and point clouds."""
+"""Parts of the reader of ROS bags: files, messages, topics, point clouds, and the robot under the laser."""

@@ -1,4 +1,4 @@
-"""What ROS 1 bags and mcap files have in common: their messages lie in chunks, packed or not."""
+"""Base class of ROS 1 bags and mcap files, whose messages are stored in chunks, compressed or not."""
 
 import bz2
 import heapq
@@ -16,7 +16,7 @@ from typing import Any, BinaryIO, NamedTuple, TypeAlias
 from rcnn_odom.recordings.packing import import_zstd
 
 LONGEST_RUN = 1 << 20
-"""Bytes of messages outside of chunks that are read at once."""
+"""Bytes of messages outside of chunks that are read together as one chunk."""
 CUT_OFF, DAMAGED = "it ends within a record", "a record of it is damaged"
 
 Message: TypeAlias = tuple[int, int, memoryview]
@@ -24,20 +24,20 @@ Message: TypeAlias = tuple[int, int, memoryview]
 
 
 class BrokenBag(Exception):
-    """A file of a bag is damaged or ends too early; what came before was given. Says why, in words."""
+    """A file of a bag is damaged or cut off; the message says why. What can be read was read before."""
 
 
 class NoBag(Exception):
-    """A file is whole, but of something else. Says of what, in words."""
+    """A file is not damaged, but is not a bag; the message says what it is."""
 
 
 class Connection(NamedTuple):
-    """Who writes the messages of a topic.
+    """A writer of messages of a topic.
 
     Attributes:
-        topic: its name.
+        topic: name of the topic.
         kind: type of the messages, for instance ``sensor_msgs/msg/LaserScan``; empty if unknown.
-        encoding: of the messages, ``ros1`` or ``cdr`` or another.
+        encoding: encoding of the messages, ``ros1``, ``cdr`` or another one.
     """
 
     topic: str
@@ -47,15 +47,15 @@ class Connection(NamedTuple):
 
 @dataclass
 class Chunk:
-    """Where messages lie in a file.
+    """A part of a file with messages.
 
     Attributes:
-        position, length: in bytes, of the content as it lies in the file.
-        packing: ``lz4`` for instance; empty or ``none``: not packed.
-        start: nanoseconds, arrival of its first message; None: not known yet.
-        checksum: CRC-32 of the unpacked content, 0 if unknown.
-        is_whole: the file does not end within it.
-        counts: messages of each connection; empty: not known yet.
+        position, length: bytes, of the content as it is stored in the file.
+        packing: compression, for instance ``lz4``; empty or ``none``: not compressed.
+        start: nanoseconds, arrival of the first message; None: not known yet.
+        checksum: CRC-32 of the decompressed content; 0: unknown.
+        is_whole: whether the file holds the whole chunk.
+        counts: number of messages of each connection; empty: not known yet.
     """
 
     position: int
@@ -68,18 +68,18 @@ class Chunk:
 
 
 class ChunkedFile(ABC):
-    """A file of a bag whose messages lie in chunks.
+    """A file of a bag whose messages are stored in chunks.
 
-    An index at the end is not needed: the whole file is gone through once, and what lies between the heads of
-    records is passed over, so that a file that breaks off gives what is there.
+    No index at the end of the file is needed. The headers of all records are read once, without the data
+    between them, so the messages of a file that was cut off can be read up to the cut.
 
     Args:
-        path: of the file, not packed itself.
+        path: path of the file, not compressed as a whole.
 
     Attributes:
-        connections: by their numbers.
-        counts: messages of each connection.
-        broken: why the file ends too early, in words; empty where it does not.
+        connections: the connections by their numbers.
+        counts: number of messages of each connection.
+        broken: why the file is cut off or damaged; empty if it is not.
     """
 
     def __init__(self, path: Path) -> None:
@@ -97,18 +97,21 @@ class ChunkedFile(ABC):
                     chunk.counts.clear()  # its index may be cut off
             for chunk in self._chunks:
                 if not chunk.counts or not chunk.counts.keys() <= self.connections.keys():
-                    self._look_into(file, chunk)
+                    self._index_chunk(file, chunk)
                 self.counts.update(chunk.counts)
 
     def messages(self, wanted: set[int]) -> Iterator[Message]:
-        """The messages of some connections in the order of their arrival.
+        """Yield the messages of some connections in the order of their arrival.
+
+        Args:
+            wanted: numbers of the connections.
 
         Raises:
-            BrokenBag: the file is damaged; after the last message that can be read.
+            BrokenBag: the file is damaged; raised after the last message that can be read.
         """
         with self.path.open("rb") as file:
             chunks = [chunk for chunk in self._chunks if wanted & chunk.counts.keys()]
-            yield from in_order(
+            yield from sort_messages(
                 (chunk.start or 0, partial(self._messages_of, file, chunk, wanted)) for chunk in chunks
             )
         if self.broken:
@@ -116,14 +119,22 @@ class ChunkedFile(ABC):
 
     @abstractmethod
     def _read_outline(self, file: BinaryIO, size: int) -> None:
-        """Finds chunks and connections; raises BrokenBag where the file is damaged."""
+        """Find chunks and connections.
+
+        Raises:
+            BrokenBag: the file is damaged or cut off; what was found before is kept.
+        """
 
     @abstractmethod
     def _parse(self, content: memoryview) -> Iterator[Message]:
-        """The messages in a chunk, in its order; adds its connections. Raises BrokenBag where damaged."""
+        """Yield the messages of a chunk in its own order, and add its connections.
+
+        Raises:
+            BrokenBag: the chunk is damaged or cut off.
+        """
 
     def _add_loose(self, position: int, length: int, connection: int, time: int) -> None:
-        """A message record outside of chunks; such that follow each other are read as one chunk."""
+        """Add a message record outside of chunks; records that follow each other are read as one chunk."""
         run = self._run
         if run is None or run.position + run.length != position or run.length > LONGEST_RUN:
             run = self._run = Chunk(position, 0, start=time)
@@ -132,8 +143,8 @@ class ChunkedFile(ABC):
         run.start = min(time, time if run.start is None else run.start)
         run.counts[connection] += 1
 
-    def _look_into(self, file: BinaryIO, chunk: Chunk) -> None:
-        """Learns from a chunk's content what no index says."""
+    def _index_chunk(self, file: BinaryIO, chunk: Chunk) -> None:
+        """Count the messages of a chunk without an index, and find the time of the first one."""
         chunk.counts, chunk.start = Counter(), None
         try:
             for time, connection, _ in self._parse(_read_content(file, chunk)):
@@ -148,14 +159,19 @@ class ChunkedFile(ABC):
                 yield message
 
 
-def in_order(chunks: Iterable[tuple[int, Callable[[], Iterable[Message]]]]) -> Iterator[Message]:
-    """The messages of chunks in the order of time; only chunks that overlap are in memory together.
+def sort_messages(chunks: Iterable[tuple[int, Callable[[], Iterable[Message]]]]) -> Iterator[Message]:
+    """Sort the messages of chunks by time; only chunks that overlap in time are in memory together.
 
     Args:
-        chunks: nanoseconds of the first message, and what reads them all.
+        chunks: for each chunk, the time of its first message in nanoseconds, and a function that reads its
+            messages.
 
     Raises:
-        BrokenBag: one could not be read; after the messages that came before.
+        BrokenBag: a chunk cannot be read; raised after the messages before it.
+
+    >>> chunks = [(5, lambda: [(5, 0, b"b")]), (1, lambda: [(1, 0, b"a"), (7, 0, b"c")])]
+    >>> [content for _, _, content in sort_messages(chunks)]
+    [b'a', b'b', b'c']
     """
     pending: list[tuple[int, int, Message]] = []
     in_file = count()
@@ -176,7 +192,7 @@ def in_order(chunks: Iterable[tuple[int, Callable[[], Iterable[Message]]]]) -> I
 
 
 def read_exactly(file: BinaryIO, count: int) -> bytes:
-    """So many bytes.
+    """Read ``count`` bytes.
 
     Raises:
         BrokenBag: the file ends before.
@@ -188,7 +204,7 @@ def read_exactly(file: BinaryIO, count: int) -> bytes:
 
 
 def message_type(name: str) -> str:
-    """The name of a message type as ROS 2 has it: ``sensor_msgs/msg/LaserScan`` for ROS 1's without ``msg``.
+    """Convert the name of a message type to that of ROS 2; ROS 1 has no ``msg`` in it.
 
     >>> message_type("sensor_msgs/LaserScan")
     'sensor_msgs/msg/LaserScan'
@@ -198,11 +214,11 @@ def message_type(name: str) -> str:
 
 
 def _read_content(file: BinaryIO, chunk: Chunk) -> memoryview:
-    """What is in a chunk, unpacked; of one that the file ends in, what is there."""
+    """Read and decompress the content of a chunk; of a chunk that was cut off, the part that is there."""
     file.seek(chunk.position)
     content = _unpack(file.read(chunk.length), chunk.packing)
     if chunk.checksum and chunk.is_whole and zlib.crc32(content) != chunk.checksum:
-        raise BrokenBag("a chunk of it is damaged, as its checksum says")
+        raise BrokenBag("a chunk of it is damaged: its checksum is wrong")
     return memoryview(content)
 
 
@@ -211,10 +227,10 @@ def _unpack(content: bytes, packing: str) -> bytes:
         return content
     unpackers, errors = _unpackers()
     if packing not in unpackers:
-        raise BrokenBag(f"its chunks are packed by {packing!r}, which is not known here")
+        raise BrokenBag(f"its chunks are packed by {packing!r}, which is not supported")
     unpacked = []
     try:
-        while content:  # which may be of several frames
+        while content:  # it may consist of several compressed frames
             unpacker = unpackers[packing]()
             unpacked.append(unpacker.decompress(content))
             content = unpacker.unused_data or b""
@@ -224,7 +240,7 @@ def _unpack(content: bytes, packing: str) -> bytes:
 
 
 def _unpackers() -> tuple[dict[str, Callable[[], Any]], tuple[type[Exception], ...]]:
-    """What unpacks piece by piece, and so the beginning of what was cut off; and what they raise."""
+    """Decompressors by name, which also read the beginning of data that was cut off; and their errors."""
     import lz4.frame
 
     zstd = import_zstd()

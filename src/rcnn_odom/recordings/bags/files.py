@@ -1,4 +1,4 @@
-"""ROS bags as files: which a bag consists of, of what kind each is, and the messages of a topic."""
+"""Finds and opens the files of a ROS bag, and reads the messages of a topic from them."""
 
 import re
 from collections import Counter, defaultdict
@@ -15,12 +15,12 @@ from rcnn_odom.recordings.bags.sqlite import SqliteFile
 from rcnn_odom.recordings.packing import read_head, unpacked_file
 
 METADATA = "metadata.yaml"
-"""What the folder of a ROS 2 bag holds."""
+"""A file in the folder of a ROS 2 bag."""
 STORAGE_SUFFIXES = (".db3", ".mcap")
-"""Of the files in such a folder."""
+"""Suffixes of the files with messages in such a folder."""
 SUFFIXES = (".bag", *STORAGE_SUFFIXES)
 FURTHER_SUFFIXES = (".active", ".gz", ".bz2", ".xz", ".zst", ".zstd")
-"""What may come after them."""
+"""Suffixes that may follow ``SUFFIXES``."""
 ROS1 = b"#ROSBAG V2"
 OLD_ROS1 = (b"#ROSBAG V1", b"#ROSRECORD V1")
 BagFile: TypeAlias = ChunkedFile | SqliteFile
@@ -29,20 +29,20 @@ KINDS: dict[bytes, Callable[[Path], BagFile]] = {
     MAGIC: McapFile,
     b"SQLite format 3\0": SqliteFile,
 }
-"""First bytes of files of bags, and what reads them."""
-MENDED_BY = (
-    "a bag whose recording was cut off is mended by 'rosbag reindex' or 'ros2 bag reindex', "
+"""First bytes of the files of bags, and the classes that read them."""
+REPAIR_ADVICE = (
+    "a bag whose recording was cut off can be repaired by 'rosbag reindex' or 'ros2 bag reindex', "
     "mcap by 'mcap recover'"
 )
 
 
 class RawMessage(NamedTuple):
-    """A message as it is written.
+    """A message before it is decoded.
 
     Attributes:
-        encoding: ``ros1``, ``cdr`` or another.
-        arrival: nanoseconds.
-        content: its bytes.
+        encoding: ``ros1``, ``cdr`` or another one.
+        arrival: time of arrival in nanoseconds.
+        content: bytes of the message.
     """
 
     encoding: str
@@ -51,17 +51,17 @@ class RawMessage(NamedTuple):
 
 
 class Bag:
-    """The files of a bag, one after the other.
+    """A bag: its files are read one after another.
 
     Args:
-        files: in their order, each with its name.
-        unpacked: removes what was unpacked for them.
-        faults: of files that cannot be opened, in words.
-        notes: what a user should know of the files.
+        files: name and file, in order.
+        unpacked: closes and removes the temporary files.
+        faults: messages about files that cannot be opened.
+        notes: messages for the user.
 
     Attributes:
-        topics: by name, the number of messages of each type.
-        broken: what is wrong with files that end too early or cannot be opened; empty where none does.
+        topics: for the name of each topic, the number of messages of each type.
+        broken: faults of the files that are cut off or cannot be opened; empty if there are none.
     """
 
     def __init__(
@@ -80,16 +80,16 @@ class Bag:
         self.broken = ", ".join((*broken, *faults))
 
     def encodings(self, topic: str, kind: str) -> set[str]:
-        """Of the messages of a topic that are of a type."""
+        """The encodings of a topic's messages of a type."""
         connections = [c for _, file in self._files for c in file.connections.values()]
         return {c.encoding for c in connections if (c.topic, c.kind) == (topic, kind)}
 
     def messages(self, topic: str, kind: str) -> Iterator[RawMessage]:
-        """The messages of a topic that are of a type, those of each file in the order of their arrival.
+        """Yield the messages of a topic of one type, file by file, in each file in the order of arrival.
 
         Raises:
-            BrokenBag: a file is damaged or cannot be opened; after the last message that can be read, also of
-                the files that come after it.
+            BrokenBag: a file is damaged or cannot be opened; raised after the last message of all files that
+                can be read.
         """
         faults = list(self._faults)
         for name, file in self._files:
@@ -107,12 +107,12 @@ class Bag:
         return f"{name}: {fault}" if is_one_of_several else fault
 
     def close(self) -> None:
-        """Removes what was unpacked."""
+        """Remove the temporary files."""
         self._unpacked.close()
 
 
 def is_bag(path: Path) -> bool:
-    """Whether it is a file or a folder of a bag by its first bytes, or at least named like one."""
+    """Whether the path is a bag's file or folder, by its first bytes or by its name."""
     if path.is_dir():
         return (path / METADATA).is_file() or bool(_storage_files(path))
     if not path.is_file():
@@ -126,13 +126,13 @@ def is_bag(path: Path) -> bool:
 
 
 def open_bag(path: Path) -> Bag:
-    """Opens all files of a bag; of several, those that can be opened.
+    """Open the files of a bag; if there are several, those that can be opened.
 
     Args:
-        path: of a file, packed or not; of the folder of a ROS 2 bag, or of the metadata.yaml in it.
+        path: a file, compressed or not; the folder of a ROS 2 bag; or the metadata.yaml in it.
 
     Raises:
-        InputError: a file is missing, no bag, or all are so damaged that nothing in them can be read.
+        InputError: a file is missing, or no file can be opened as a bag.
     """
     paths, notes = files_of(path)
     files: list[tuple[str, BagFile]] = []
@@ -145,24 +145,27 @@ def open_bag(path: Path) -> Bag:
                 errors[each] = error
         if not files:
             raise errors[paths[0]]
-        faults = tuple(f"{each.name}: {_fault(each, error)}" for each, error in errors.items())
+        faults = tuple(f"{each.name}: {_shorten_error(each, error)}" for each, error in errors.items())
         left_out = tuple(f"left out: {fault}" for fault in faults)
         return Bag(files, stack.pop_all(), faults, (*notes, *left_out))
 
 
-def _fault(path: Path, error: InputError) -> str:
-    """What is wrong, without the file's path and the advice."""
+def _shorten_error(path: Path, error: InputError) -> str:
+    """The message of an error without the file's path and without the advice."""
     return str(error).removeprefix(f"{path}: ").partition("; ")[0]
 
 
 def files_of(path: Path) -> tuple[list[Path], tuple[str, ...]]:
-    """The files of a bag in their order, and a note where it is not plain which these are.
+    """Find the files of a bag.
 
-    A folder's are those that its metadata.yaml names; where that is missing or cannot be read, all that are
-    there, in the order of the numbers in their names.
+    The files of a folder are those named in its metadata.yaml. If that is missing or cannot be read, they are
+    all .db3 and .mcap files in the folder, in the order of the numbers in their names.
+
+    Returns:
+        The files in order, and a note if there are several or metadata.yaml could not be used.
 
     Raises:
-        InputError: metadata.yaml names a file that is missing, or there is none.
+        InputError: metadata.yaml names a file that is missing, or there is no file.
     """
     if path.name == METADATA and path.is_file():
         path = path.absolute().parent
@@ -170,12 +173,12 @@ def files_of(path: Path) -> tuple[list[Path], tuple[str, ...]]:
         return [path], ()
     metadata = path / METADATA
     named = _named_files(metadata)
-    found = [_find(path, name) for name in named] or _storage_files(path)
+    found = [_find_named_file(path, name) for name in named] or _storage_files(path)
     if not found:
         raise InputError(f"{path}: no .db3 or .mcap file beside {METADATA}; copy the files of the bag too")
     listed = ", ".join(file.name for file in found)
     if metadata.exists() and not named:
-        return found, (f"{METADATA} names no files that can be read; what is there is read: {listed}",)
+        return found, (f"{METADATA} names no files that can be read; files in the folder are read: {listed}",)
     return found, (f"{len(found)} files: {listed}",) if len(found) > 1 else ()
 
 
@@ -187,14 +190,16 @@ def _is_named_like_bag(path: Path) -> bool:
 
 
 def _storage_files(folder: Path) -> list[Path]:
-    def natural(path: Path) -> list[Any]:
-        # Digits and other text take turns, so that a number is compared with a number.
+    """The .db3 and .mcap files of a folder, in the order of the numbers in their names."""
+
+    def natural_order(path: Path) -> list[Any]:
+        # Numbers and other text alternate, so a number is always compared with a number.
         return [int(part) if part.isdecimal() else part for part in re.split(r"(\d+)", path.name)]
 
     wanted = re.compile(r".*\.(db3|mcap)(\.zstd?)?", re.IGNORECASE)
     found = {path for path in folder.iterdir() if wanted.fullmatch(path.name) and path.is_file()}
-    # What was unpacked beside its packed file is not read twice.
-    return sorted((path for path in found if not _is_packed_twin(path, found)), key=natural)
+    # A file that was decompressed beside its compressed file is not read twice.
+    return sorted((path for path in found if not _is_packed_twin(path, found)), key=natural_order)
 
 
 def _is_packed_twin(path: Path, found: set[Path]) -> bool:
@@ -202,7 +207,7 @@ def _is_packed_twin(path: Path, found: set[Path]) -> bool:
 
 
 def _named_files(metadata: Path) -> list[str]:
-    """The files that a metadata.yaml names; none where it is missing or cannot be read."""
+    """The files that a metadata.yaml names; none if it is missing or cannot be read."""
     import yaml
 
     try:
@@ -214,8 +219,12 @@ def _named_files(metadata: Path) -> list[str]:
     return named if is_list else []
 
 
-def _find(folder: Path, name: str) -> Path:
-    """The file of this name, unpacked or packed since it was named."""
+def _find_named_file(folder: Path, name: str) -> Path:
+    """Find a file that metadata.yaml names; it may have been compressed or decompressed since.
+
+    Raises:
+        InputError: there is no such file.
+    """
     names = (name, f"{name}.zstd", name.removesuffix(".zstd"))
     places = [folder / place for each in names for place in (Path(each).name, each)]
     found = next((place for place in places if place.is_file()), None)
@@ -230,17 +239,17 @@ def _find(folder: Path, name: str) -> Path:
 def _open_file(path: Path, stack: ExitStack) -> BagFile:
     head = read_head(path)
     if not head:
-        raise InputError(f"{path}: is empty; {MENDED_BY}, but here is nothing, so copy or record it again")
+        raise InputError(f"{path}: is empty; {REPAIR_ADVICE}, but not an empty file: copy or record it again")
     if head.startswith(OLD_ROS1):
         raise InputError(
-            f"{path}: is a ROS bag of before version 2.0 of the format (2010); rewrite it by ROS 1's 'rosbag "
+            f"{path}: is a ROS bag in a format before version 2.0 (2010); convert it with ROS 1's 'rosbag "
             "filter OLD NEW True'"
         )
     kind = next((kind for magic, kind in KINDS.items() if head.startswith(magic)), None)
     if kind is None:
         raise InputError(
-            f"{path}: is named like a ROS bag, but begins with {head[:16]!r}, as no bag of ROS 1, sqlite3 or "
-            "mcap does; give the bag itself, or name the file as what it is"
+            f"{path}: is named like a ROS bag, but begins with {head[:16]!r}, unlike bags of ROS 1, sqlite3 "
+            "or mcap; give the bag itself, or correct the name of the file"
         )
     unpacked = stack.enter_context(unpacked_file(path))
     try:
@@ -248,7 +257,7 @@ def _open_file(path: Path, stack: ExitStack) -> BagFile:
     except NoBag as error:
         raise InputError(f"{path}: {error}; give the bag itself") from error
     except (BrokenBag, OSError) as error:
-        raise InputError(f"{path}: cannot be opened as a ROS bag ({error}); {MENDED_BY}") from error
+        raise InputError(f"{path}: cannot be opened as a ROS bag ({error}); {REPAIR_ADVICE}") from error
     if file.broken and not file.connections:
-        raise InputError(f"{path}: cannot be opened as a ROS bag ({file.broken}); {MENDED_BY}")
+        raise InputError(f"{path}: cannot be opened as a ROS bag ({file.broken}); {REPAIR_ADVICE}")
     return file

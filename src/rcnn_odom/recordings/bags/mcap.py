@@ -1,7 +1,7 @@
-"""Files in the format mcap (https://mcap.dev/spec), of ROS 2 or of ROS 1.
+"""Reads files in the format mcap (https://mcap.dev/spec), of ROS 2 or of ROS 1.
 
-Read here and not by the package ``mcap``, which gives up the whole file where one text of a topic that nobody
-asks for is damaged, and which reads none of a chunk that was cut off.
+The package ``mcap`` is not used, because it rejects a whole file if one string of any topic is damaged, and
+cannot read a chunk that was cut off.
 """
 
 import struct
@@ -28,11 +28,11 @@ CHUNK_HEAD = struct.Struct("<QQQLL")  # first and last time, length and CRC-32 u
 INDEX_HEAD, INDEX_ENTRY = struct.Struct("<HL"), 16
 UINT16, UINT32, UINT64 = struct.Struct("<H"), struct.Struct("<L"), struct.Struct("<Q")
 LONGEST_NAME = 64
-"""Bytes of the name of a packing; a longer one is damaged."""
+"""Bytes of the name of a compression; a longer name is taken to be damaged."""
 
 
 class McapFile(ChunkedFile):
-    """A file in mcap; see :class:`ChunkedFile`. The content of schemas is not looked at."""
+    """A file in mcap; see :class:`ChunkedFile`. The message definitions in its schemas are not used."""
 
     def _read_outline(self, file: BinaryIO, size: int) -> None:
         self._kinds: dict[int, str] = {}
@@ -42,9 +42,9 @@ class McapFile(ChunkedFile):
             kind, length = HEAD.unpack(read_exactly(file, HEAD.size))
             end = position + HEAD.size + length
             if kind == FOOTER:
-                _need_end(file, end)
+                _check_end(file, end)
                 return
-            if kind == 0:  # what a computer leaves that lost its power
+            if kind == 0:  # zeros, which a computer leaves when it loses power
                 raise BrokenBag(DAMAGED)
             if kind == CHUNK:
                 self._add_chunk(file, end, size)
@@ -58,7 +58,7 @@ class McapFile(ChunkedFile):
                 channel, _, time, _ = MESSAGE_HEAD.unpack(read_exactly(file, MESSAGE_HEAD.size))
                 self._add_loose(position, end - position, channel, time)
             elif kind in (SCHEMA, CHANNEL):
-                self._define(kind, memoryview(read_exactly(file, length)))
+                self._add_definition(kind, memoryview(read_exactly(file, length)))
             position = end
 
     def _add_chunk(self, file: BinaryIO, end: int, size: int) -> None:
@@ -90,35 +90,39 @@ class McapFile(ChunkedFile):
                 channel, _, time, _ = MESSAGE_HEAD.unpack_from(content, start)
                 yield time, channel, content[data:position]
             elif kind in (SCHEMA, CHANNEL):
-                self._define(kind, content[start:position])
+                self._add_definition(kind, content[start:position])
 
-    def _define(self, kind: int, record: memoryview) -> None:
-        """Adds a schema or a channel; one that is damaged is as if it were not there."""
+    def _add_definition(self, kind: int, record: memoryview) -> None:
+        """Add a schema or a channel; a damaged one is ignored."""
         try:
             (number,) = UINT16.unpack_from(record, 0)
             if kind == SCHEMA:
-                self._kinds[number] = message_type(_text(record, 2)[0])
+                self._kinds[number] = message_type(_read_string(record, 2)[0])
                 return
             (schema,) = UINT16.unpack_from(record, 2)
-            topic, after = _text(record, 4)
-            encoding, _ = _text(record, after)
+            topic, after = _read_string(record, 4)
+            encoding, _ = _read_string(record, after)
         except struct.error:
             return
         encoding = (encoding or "cdr").lower()
         self.connections[number] = Connection(topic, self._kinds.get(schema, ""), encoding)
 
 
-def _need_end(file: BinaryIO, position: int) -> None:
-    """Raises BrokenBag where anything but the end follows after the footer, as in files put together."""
+def _check_end(file: BinaryIO, position: int) -> None:
+    """Check that only the end of the file follows the footer, unlike in files that were joined.
+
+    Raises:
+        BrokenBag: something else follows.
+    """
     file.seek(position)
     if read_exactly(file, len(MAGIC)) != MAGIC:
         raise BrokenBag(DAMAGED)
     if file.read(1):
-        raise BrokenBag("something follows after its end, as where files were put together")
+        raise BrokenBag("something follows after its end, as if files had been joined")
 
 
-def _text(record: memoryview, position: int) -> tuple[str, int]:
-    """A text of a record, and the position after it."""
+def _read_string(record: memoryview, position: int) -> tuple[str, int]:
+    """Read a string of a record; returns it and the position after it."""
     start = position + UINT32.size
     end = start + UINT32.unpack_from(record, position)[0]
     return bytes(record[start:end]).decode(errors="replace"), end

@@ -1,4 +1,4 @@
-"""Messages of a bag out of their bytes, by the types that ROS itself has; and the stamps of a topic."""
+"""Decodes messages of a bag with ROS's own message definitions, and finds their stamps."""
 
 from collections import Counter
 from collections.abc import Callable, Iterator
@@ -11,25 +11,25 @@ from rcnn_odom.recordings.bags.topics import TRANSFORMS, short_name
 from rcnn_odom.recordings.packing import import_zstd
 
 ZSTD = b"\x28\xb5\x2f\xfd"
-"""First bytes of a message that ROS 2 packed by itself."""
+"""First bytes of a message that ROS 2 compressed on its own."""
 
 
 def header_stamp(message: Any) -> float:
-    """Seconds; 0 where the header has none."""
+    """Stamp of a message's header in seconds; 0 if it was not set."""
     return float(message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec)
 
 
 class Clock:
-    """The stamps of a topic: of the headers, or the times of arrival where the first header has none.
+    """Gives the stamps of a topic: those of the headers, or times of arrival if the first header has none.
 
-    The two are not mixed, since they may be of clocks that know nothing of each other.
+    The two are never mixed, because they may come from clocks that differ.
     """
 
     def __init__(self) -> None:
         self._has_headers: bool | None = None
 
     def stamp(self, message: Any, arrival: int) -> float | None:
-        """Seconds; None where the header of a single message has no time."""
+        """Stamp of the next message in seconds; None if headers have stamps, but this one has none."""
         stamp = header_stamp(message)
         if self._has_headers is None:
             self._has_headers = stamp != 0
@@ -37,9 +37,15 @@ class Clock:
 
 
 def read_known(bag: Bag, topic: str, kind: str, unreadable: Counter[str]) -> Iterator[tuple[Any, int]]:
-    """The messages of a topic beside the scans, and their nanoseconds of arrival; counts those that are none.
+    """Yield the messages of a topic and their times of arrival in nanoseconds.
 
-    That a bag breaks off is told where its scans are read.
+    If the bag is cut off or damaged, the iteration ends there; the reader of the scans reports it.
+
+    Args:
+        bag: bag to read from.
+        topic: name of the topic.
+        kind: type of its messages.
+        unreadable: counts the messages that cannot be decoded, by topic.
     """
     try:
         for encoding, arrival, content in bag.messages(topic, kind):
@@ -52,10 +58,15 @@ def read_known(bag: Bag, topic: str, kind: str, unreadable: Counter[str]) -> Ite
 
 
 def deserialize(content: memoryview, encoding: str, kind: str) -> Any:
-    """A message of a type of ROS out of its bytes.
+    """Decode a message.
+
+    Args:
+        content: bytes of the message.
+        encoding: ``cdr`` or ``ros1``.
+        kind: type of the message, one of ROS's own.
 
     Raises:
-        ValueError: they are none.
+        ValueError: the bytes are not such a message, or the encoding is another one.
     """
     if encoding not in ("cdr", "ros1"):
         raise ValueError(f"it is in {encoding}, not in cdr or ros1")
@@ -63,8 +74,8 @@ def deserialize(content: memoryview, encoding: str, kind: str) -> Any:
         content = _unpack(content)
     try:
         return _deserializer(encoding)(content, kind)
-    except Exception as error:  # whatever the bytes of a damaged message lead to
-        raise ValueError(f"its {len(content)} bytes are no {short_name(kind)}") from error
+    except Exception as error:  # a damaged message can cause any exception
+        raise ValueError(f"its {len(content)} bytes are not a {short_name(kind)}") from error
 
 
 def _unpack(content: memoryview) -> memoryview:
@@ -81,7 +92,7 @@ def _deserializer(encoding: str) -> Callable[[memoryview, str], Any]:
 
     if encoding == "cdr":
         return get_typestore(Stores.LATEST).deserialize_cdr
-    store = get_typestore(Stores.ROS1_NOETIC)  # where a header has a sequence number
-    # Its types are those of ROS 1's core, of which the transforms' message is none.
+    store = get_typestore(Stores.ROS1_NOETIC)  # here a header has a sequence number
+    # This store only has the types of ROS 1's core, without the message for transforms.
     store.register(get_types_from_msg("geometry_msgs/TransformStamped[] transforms", TRANSFORMS))
     return store.deserialize_ros1

@@ -1,4 +1,4 @@
-"""ROS's message PointCloud2 of a laser with many beams, cut to what one planar laser sees."""
+"""Reads ROS's message PointCloud2 of a laser with many beams, and cuts it to the scan of a planar laser."""
 
 import math
 from collections.abc import Callable, Sequence
@@ -12,23 +12,23 @@ from rcnn_odom.recordings.laser_scan import checked_times
 from rcnn_odom.recordings.velodyne import FARTHEST
 
 TYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 8: "f8"}
-"""Of fields, by the numbers of sensor_msgs/msg/PointField."""
+"""Types of fields by the numbers of sensor_msgs/msg/PointField."""
 RING_FIELDS = ("ring", "channel")
-"""Names under which drivers write which of their lasers saw a point."""
+"""Drivers' names of the field with the number of the laser that measured a point."""
 PLANE = 1e-3
-"""Metres between the lowest and the highest point of a laser that has a single plane."""
+"""Metres; largest difference in z between the points of a laser with a single plane."""
 TIME_FIELDS = ("time", "t", "timestamp", "offset_time", "time_stamp")
-"""Names under which drivers write when a point was seen."""
+"""Drivers' names of the field with the time of a point."""
 NANOSECONDS = 1e12
-"""Seconds that no clock shows: such numbers are nanoseconds."""
+"""Larger times are in nanoseconds, because no clock shows so many seconds."""
 LONG_AGO = 1e6
-"""Seconds: such times are not after the stamp of a cloud, but of a clock."""
+"""Seconds; larger times are those of a clock, not times after the stamp of the cloud."""
 SAME_BEAM_DEG = 0.01
-"""Bearings closer than this are of one beam, seen twice."""
+"""Points whose bearings differ by less are of the same beam."""
 MOST_SPREAD = np.deg2rad(1.0)
-"""Of a ring about its cone: in another frame than its laser's it is wider."""
+"""Largest spread of a ring about its cone; it is larger if the frame is not the laser's."""
 LEAST_POINTS = 30
-"""Of a cut cloud, to tell the spacing of its beams."""
+"""Least number of gaps between points from which the spacing of beams is found."""
 
 IN_ITS_FRAME = "publish it in its laser's frame, or choose --ring N or --height"
 
@@ -40,9 +40,9 @@ class Cloud(NamedTuple):
 
     Attributes:
         points: (P, 3) metres.
-        rings: by name of the numbering, (P,) the number of the ring of each point: ``ring`` as the message
-            has it; ``row`` and ``column`` of a cloud that lies in a grid.
-        times: (P,) as the message has them, see :func:`seconds_after`; None: it has none.
+        rings: for each numbering of rings, (P,) the ring of each point: ``ring`` from the field of the
+            message; ``row`` and ``column`` in a cloud that is a grid.
+        times: (P,) as in the message, see :func:`seconds_after`; None: the message has no times.
     """
 
     points: Points
@@ -51,14 +51,14 @@ class Cloud(NamedTuple):
 
 
 Cut: TypeAlias = Callable[[Cloud], npt.NDArray[np.bool_]]
-"""Which points (P,) of a cloud a planar laser sees."""
+"""Gives the mask (P,) of the points of a cloud that belong to the planar scan."""
 
 
 def read_cloud(message: Any) -> Cloud:
-    """The returns of a message PointCloud2; what is not finite, or lies in the laser itself, is none.
+    """Read the returns of a PointCloud2 message; points that are not finite or at the origin are left out.
 
     Raises:
-        ValueError: it has no x, y or z, or fewer bytes than it promises.
+        ValueError: the message has no x, y or z, or fewer bytes than its size requires.
     """
     fields = {field.name: field for field in message.fields}
     missing = [name for name in "xyz" if name not in fields]
@@ -66,9 +66,9 @@ def read_cloud(message: Any) -> Cloud:
         raise ValueError(f"it has no field {' and no '.join(missing)}, only {', '.join(fields) or 'none'}")
     ring = next((name for name in RING_FIELDS if name in fields), None)
     time = next((name for name in TIME_FIELDS if _lies_within(fields.get(name), message)), None)
-    grid = _grid(message, [fields[name] for name in ("x", "y", "z", ring, time) if name])
+    grid = _read_grid(message, [fields[name] for name in ("x", "y", "z", ring, time) if name])
     points = np.stack([grid[name] for name in "xyz"], axis=-1)  # (rows, columns, 3)
-    seen = (np.abs(points) < FARTHEST).all(-1) & points.any(-1)  # not so of nan
+    seen = (np.abs(points) < FARTHEST).all(-1) & points.any(-1)  # False for nan
     rings = {}
     if ring:
         rings["ring"] = np.clip(np.nan_to_num(grid[ring][seen]), -1e9, 1e9).astype(np.int64)
@@ -78,7 +78,7 @@ def read_cloud(message: Any) -> Cloud:
 
 
 def _lies_within(field: Any, message: Any) -> bool:
-    """Whether a field is there and can be read: points without times are points all the same."""
+    """Whether an optional field exists and can be read."""
     if field is None or int(field.datatype) not in TYPES:
         return False
     size = np.dtype(TYPES[int(field.datatype)]).itemsize
@@ -86,34 +86,42 @@ def _lies_within(field: Any, message: Any) -> bool:
 
 
 def seconds_after(stamp: float | None, times: npt.NDArray[Any]) -> npt.NDArray[np.float64] | None:
-    """Seconds (P,) of points after the stamp of their cloud.
+    """Convert the times of points to seconds after the stamp of their cloud.
 
-    Drivers write whole numbers of nanoseconds (Ouster's ``t``, Livox's ``offset_time``) or seconds as a
-    fraction (Velodyne's ``time``), after the stamp or since 1970 (``timestamp``, Livox's in nanoseconds).
+    Drivers write integer nanoseconds (Ouster's ``t``, Livox's ``offset_time``) or seconds as floats
+    (Velodyne's ``time``), either after the stamp or since 1970 (``timestamp``, Livox's in nanoseconds).
 
     Args:
         stamp: seconds; None: unknown.
-        times: (P,) as they are in the message.
+        times: (P,) as in the message.
 
     Returns:
-        None where a point is more than ten seconds away or its time no number, and where all are the same.
+        (P,) seconds. None if a time is not finite or more than ten seconds from the stamp, or if all times
+        are equal.
+
+    >>> seconds_after(100.0, np.array([0, 50_000_000], dtype=np.uint32))
+    array([0.  , 0.05])
     """
     if not len(times):
         return np.zeros(0)
     since = times.min()
-    if not np.isfinite(since) or since == times.max():  # min is nan where one is
+    if not np.isfinite(since) or since == times.max():  # min is nan if any time is nan
         return None
     is_nanoseconds = times.dtype.kind in "iu" or abs(since) > NANOSECONDS
     unit = 1e-9 if is_nanoseconds else 1.0
-    seconds = unit * (times - since).astype(np.float64)  # of large numbers the small difference
+    seconds = unit * (times - since).astype(np.float64)  # subtracted first, because the times may be large
     start = unit * float(since)
     if abs(start) > LONG_AGO:
         start = math.nan if stamp is None else start - stamp
     return checked_times(start + seconds)
 
 
-def _grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
-    """Some fields of the points, (rows, columns)."""
+def _read_grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
+    """Read some fields of all points into a structured array (rows, columns).
+
+    Raises:
+        ValueError: a field has an unknown type or lies outside of a point, or bytes are missing.
+    """
     rows, columns, step = int(message.height), int(message.width), int(message.point_step)
     order = ">" if message.is_bigendian else "<"
     try:
@@ -129,7 +137,7 @@ def _grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
         raise ValueError("its fields are of no known type, or lie outside of a point") from error
     if rows * columns == 0:
         return np.zeros((0, 0), layout)
-    # In a cloud of one row the length of a row says nothing, and some drivers leave it out.
+    # In a cloud of one row, the length of a row is not needed, and some drivers do not set it.
     row_step = step * columns if rows == 1 or message.row_step == 0 else int(message.row_step)
     content = np.ascontiguousarray(message.data, dtype=np.uint8)
     needed = (rows - 1) * row_step + columns * step
@@ -143,27 +151,31 @@ def _grid(message: Any, fields: Sequence[Any]) -> npt.NDArray[Any]:
 def choose_cut(
     clouds: Sequence[Cloud], ring: int | None = None, height: tuple[float, float] | None = None
 ) -> tuple[Cut, str]:
-    """What makes a planar laser's points of each cloud of a recording, and words about it.
+    """Choose how the clouds of a recording are cut to planar scans.
 
-    That is the ring nearest to level (see :mod:`rcnn_odom.recordings.velodyne`), told from where the beams
-    meet if the clouds were raised, as to the base of a robot; of clouds that do not say
-    rings, the points at the elevation of the most level beam; of clouds in one plane all.
+    If the clouds have rings, it is the ring nearest to level (see :mod:`rcnn_odom.recordings.velodyne`),
+    seen from where the beams meet, in case the clouds were shifted along z, for instance to the base of a
+    robot. If they have no rings, it is the points at the elevation of the most level beam. If all points lie
+    in one plane, it is all points.
 
     Args:
-        clouds: the first of the recording, each with points.
-        ring: another one than the most level one.
-        height: metres from and to, in the frame of the cloud: cuts a slice instead.
+        clouds: the first clouds of the recording, each with points.
+        ring: number of a ring; None: the most level one.
+        height: lowest and highest z in metres in the frame of the cloud: cut a slice instead of a ring.
+
+    Returns:
+        The cut, and a note about it.
 
     Raises:
-        ValueError: there is no such ring, no rings, or no beam near level; ring and height are given; or the
-            clouds are not in the laser's frame.
+        ValueError: there is no such ring, no rings, or no beam near level; ring and height are both given; or
+            the clouds are not in the laser's frame.
     """
     if height is not None:
         if ring is not None:
             raise ValueError("a ring and a height are two ways to cut it; give one of them")
         low, high = height
-        about = f"points at heights of {low:g} to {high:g} m"
-        return lambda cloud: _between(cloud.points[:, 2], low, high), about
+        note = f"points at heights of {low:g} to {high:g} m"
+        return lambda cloud: _between(cloud.points[:, 2], low, high), note
     if ring is None and all(np.ptp(cloud.points[:, 2]) <= PLANE for cloud in clouds):
         return lambda cloud: np.ones(len(cloud.points), bool), "all points, which lie in one plane"
     if ring is None:
@@ -172,14 +184,18 @@ def choose_cut(
     if numbering is not None:
         return _cut_ring(clouds, numbering, ring)
     if ring is not None:
-        raise ValueError("its points do not say rings; leave the ring out, or cut at a height with --height")
+        raise ValueError("its points have no rings; leave the ring out, or cut at a height with --height")
     return _cut_elevation(clouds)
 
 
 def estimate_beams(clouds: Sequence[Cloud], cut: Cut) -> Beams | None:
-    """The beams of which these points are the remaining returns; None: the points do not tell.
+    """Estimate the beams of the laser from the returns of a cut.
 
-    What the laser covers is told by all points of the clouds, since one ring may have no return in a part.
+    The spacing is found from the cut, the covered angle from all points of the clouds, because a single ring
+    may have no return in a part of it.
+
+    Returns:
+        The beams; None if there are too few points.
     """
     spacings = [_spacing_deg(cloud.points[cut(cloud)]) for cloud in clouds]
     known = [spacing for spacing in spacings if spacing is not None]
@@ -207,10 +223,10 @@ def _between(heights: Points, low: float, high: float) -> npt.NDArray[np.bool_]:
 
 
 def _find_numbering(clouds: Sequence[Cloud]) -> str | None:
-    """Which numbering of rings the clouds have; None: none.
+    """Name of the clouds' numbering of rings; None if they have none.
 
-    Rings that are all the same are none. A grid's rings are its rows or its columns, whichever are more
-    level.
+    A ``ring`` that is equal for all points is not used. In a grid, the rings are the rows or the columns,
+    whichever have the smaller spread in elevation.
     """
     if all("ring" in cloud.rings for cloud in clouds):
         numbers = np.concatenate([cloud.rings["ring"] for cloud in clouds])
@@ -219,20 +235,19 @@ def _find_numbering(clouds: Sequence[Cloud]) -> str | None:
     if not all("row" in cloud.rings for cloud in clouds):
         return None
     spread = {
-        name: np.median([s for cloud in clouds for s in _of_rings(cloud, name, np.std).values()])
+        name: np.median([s for cloud in clouds for s in _spreads_of_rings(cloud, name)])
         for name in ("row", "column")
     }
     return min(spread, key=lambda name: float(spread[name]))
 
 
-def _of_rings(cloud: Cloud, numbering: str, function: Callable[[Points], Any]) -> dict[int, float]:
-    """A function of the elevations (P,) in radians of each ring."""
-    rings = _rings_of(cloud, numbering)
-    return {number: float(function(_elevations(points, 0.0))) for number, points in rings.items()}
+def _spreads_of_rings(cloud: Cloud, numbering: str) -> list[float]:
+    """Standard deviation in radians of the elevations of each ring."""
+    return [float(np.std(_elevations(points, 0.0))) for points in _rings_of(cloud, numbering).values()]
 
 
 def _rings_of(cloud: Cloud, numbering: str) -> dict[int, Points]:
-    """The points (P, 3) of each ring."""
+    """Points (Q, 3) of each ring, by its number."""
     rings = cloud.rings[numbering]
     order = np.argsort(rings, kind="stable")
     numbers, starts = np.unique(rings[order], return_index=True)
@@ -247,17 +262,18 @@ def _elevations(points: Points, height: float) -> Points:
 
 
 def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tuple[Cut, str]:
-    from rcnn_odom.recordings.laser_frame import cone_spread, find_rise, lowered
+    """Cut of a ring, by default the one nearest to level; and a note about it."""
+    from rcnn_odom.recordings.laser_frame import cone_spread, find_rise, lower_points
     from rcnn_odom.recordings.velodyne import LEVEL, NEAR_LEVEL
 
     rings: dict[int, list[Points]] = {}
     for cloud in clouds:
         for number, points in _rings_of(cloud, numbering).items():
             rings.setdefault(number, []).append(points)
-    rise = find_rise(points for of_ring in rings.values() for points in of_ring)
+    rise = find_rise(points for frames in rings.values() for points in frames)
     elevations = {
-        number: float(np.median([np.median(_elevations(points, rise)) for points in of_ring]))
-        for number, of_ring in rings.items()
+        number: float(np.median([np.median(_elevations(points, rise)) for points in frames]))
+        for number, frames in rings.items()
     }
     if ring is None:
         ring = min(elevations, key=lambda number: abs(elevations[number] - LEVEL))
@@ -267,7 +283,7 @@ def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tupl
                 f"{np.rad2deg(elevations[ring]):+.1f}; choose one with --ring, or cut at a height with "
                 "--height"
             )
-        spread = cone_spread([lowered(points, rise) for points in rings[ring]])
+        spread = cone_spread([lower_points(points, rise) for points in rings[ring]])
         if spread > MOST_SPREAD:
             raise ValueError(
                 f"the points of {numbering} {ring} lie {np.rad2deg(spread):.1f} degrees from their cone, so "
@@ -290,6 +306,7 @@ def _cut_ring(clouds: Sequence[Cloud], numbering: str, ring: int | None) -> tupl
 
 
 def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
+    """Cut at the elevation of the beam nearest to level; and a note about it."""
     from rcnn_odom.recordings.velodyne import are_at, find_level_beam, median_elevation, points_at
 
     try:
@@ -297,8 +314,8 @@ def _cut_elevation(clouds: Sequence[Cloud]) -> tuple[Cut, str]:
     except ValueError as error:
         raise ValueError(f"{error}; cut at a height with --height") from error
     elevation = np.rad2deg(median_elevation(np.concatenate([points_at(c.points, *beam) for c in clouds])))
-    about = f"the beam at {elevation:+.2f} degrees is taken by elevation, since the points say no rings"
-    return lambda cloud: are_at(cloud.points, *beam), about
+    note = f"the beam at {elevation:+.2f} degrees is found by elevation, because the points have no rings"
+    return lambda cloud: are_at(cloud.points, *beam), note
 
 
 def _bearings(points: Points) -> npt.NDArray[np.float64]:
@@ -306,7 +323,7 @@ def _bearings(points: Points) -> npt.NDArray[np.float64]:
 
 
 def _spacing_deg(points: Points) -> float | None:
-    """Degrees between neighbouring beams; None: there are too few."""
+    """Degrees between neighbouring beams; None if there are too few points."""
     gaps = np.diff(np.sort(np.rad2deg(_bearings(points))))
     gaps = gaps[gaps > SAME_BEAM_DEG]
     return float(np.median(gaps)) if len(gaps) >= LEAST_POINTS else None

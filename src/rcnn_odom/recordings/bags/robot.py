@@ -1,4 +1,4 @@
-"""What a bag tells of the robot under its laser: where the laser sits, and the robot's own odometry."""
+"""Finds the pose of the laser on its robot in a bag, and adds the robot's own odometry to the scans."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -18,12 +18,12 @@ from rcnn_odom.recordings.stream import ScanStream
 
 @dataclass(frozen=True)
 class RobotOptions:
-    """What a user asks for.
+    """The user's options for the robot; false if none is set.
 
     Attributes:
-        odom_topic: of the robot's own odometry.
-        base: the robot's frame, in which /tf_static says where the laser sits.
-        laser_pose: x and y in metres and heading in radians of the laser on the robot, in place of that.
+        odom_topic: topic of the robot's own odometry.
+        base: the robot's frame, in which /tf_static gives the pose of the laser.
+        laser_pose: x and y in metres and heading in radians of the laser on the robot, instead of /tf_static.
     """
 
     odom_topic: str | None = None
@@ -35,35 +35,36 @@ class RobotOptions:
 
 
 def place_on_robot(stream: ScanStream, path: Path, bag: Bag, frame: str, wanted: RobotOptions) -> ScanStream:
-    """A stream with the place of its laser on the robot, and its scans with the robot's own odometry.
+    """Add the laser's pose on the robot to a stream, and the robot's own odometry to its scans.
 
     Args:
-        stream: of the bag.
-        path: of the bag, for errors.
-        bag: which the stream reads.
-        frame: that of the scans.
-        wanted: what is asked for.
+        stream: the stream of the bag's scans.
+        path: path of the bag, for errors.
+        bag: the bag that the stream reads.
+        frame: frame of the scans.
+        wanted: the user's options, at least one.
 
     Raises:
-        InputError: the bag does not tell where the laser sits on ``base``, or not that it is level; or it
-            has no such odometry.
+        InputError: /tf_static does not give the pose of the laser in ``base``, the laser is not level, or
+            the bag has no such odometry.
     """
     mount = _find_mount_on_base(path, bag, frame, wanted)
     laser_pose, beams, notes = mount and mount.pose, stream.beams, list(stream.notes)
     wheels = None
     if wanted.odom_topic:
         wheels = read_wheels(path, bag, wanted.odom_topic)
-        mount, about = _find_mount_on_wheels(wheels, bag, frame, wanted, mount)
-        notes.append(f"wheel odometry: {wheels.note}{about}")
+        mount, mount_note = _find_mount_on_wheels(wheels, bag, frame, wanted, mount)
+        notes.append(f"wheel odometry: {wheels.note}{mount_note}")
     assert mount is not None
     if mount.is_upside_down:
         notes.append("the laser is mounted upside down: its bearings are mirrored")
         beams = beams and Beams(-(beams.first + beams.covered), beams.covered, beams.spacing)
-    scans = _placed(stream.scans, mount, wheels)
+    scans = _place_scans(stream.scans, mount, wheels)
     return replace(stream, scans=scans, laser_pose=laser_pose, beams=beams, notes=tuple(notes))
 
 
-def _placed(scans: Iterator[Scan], mount: Mount, wheels: WheelOdometry | None) -> Iterator[Scan]:
+def _place_scans(scans: Iterator[Scan], mount: Mount, wheels: WheelOdometry | None) -> Iterator[Scan]:
+    """Mirror the scans of a laser that is upside down, and add wheel odometry."""
     laser = planar_to_poses([mount.pose])[0]
     for scan in scans:
         if mount.is_upside_down and scan.bearings is not None:
@@ -87,7 +88,7 @@ def _find_mount_on_base(path: Path, bag: Bag, frame: str, wanted: RobotOptions) 
 def _find_mount_on_wheels(
     wheels: WheelOdometry, bag: Bag, frame: str, wanted: RobotOptions, mount: Mount | None
 ) -> tuple[Mount, str]:
-    """Where the laser sits in the frame of the odometry, and words where that is not told."""
+    """The mount of the laser in the odometry's frame, and a note if it is unknown."""
     if wanted.laser_pose is not None or (mount and not wheels.frame):
         assert mount is not None
         return mount, ""

@@ -1,4 +1,4 @@
-"""Bags of ROS 1, version 2.0 of their format (http://wiki.ros.org/Bags/Format/2.0)."""
+"""Reads ROS 1 bags, version 2.0 of the format (http://wiki.ros.org/Bags/Format/2.0)."""
 
 import struct
 from collections.abc import Iterator
@@ -22,14 +22,14 @@ from rcnn_odom.recordings.bags.chunks import (
 MESSAGE, BAG_HEADER, INDEX, CHUNK, CONNECTION = (bytes([op]) for op in (2, 3, 4, 5, 7))
 INDEX_ENTRY = 12
 LONGEST_HEADER = 1 << 20
-"""Bytes; a longer one is damaged."""
+"""Bytes; a longer header is taken to be damaged."""
 UINT32, TIME = struct.Struct("<L"), struct.Struct("<LL")
 
 Fields = dict[bytes, bytes]
 
 
 class Ros1File(ChunkedFile):
-    """A bag of ROS 1; see :class:`ChunkedFile`. Definitions of messages are not looked at."""
+    """A bag of ROS 1; see :class:`ChunkedFile`. The message definitions in it are not used."""
 
     def _read_outline(self, file: BinaryIO, size: int) -> None:
         self._index_position = 0
@@ -40,23 +40,25 @@ class Ros1File(ChunkedFile):
             op, data = fields.get(b"op"), file.tell()
             if op is None:
                 raise BrokenBag(DAMAGED)
-            if op == INDEX:  # writers of 2010 give more bytes than there are
-                length = INDEX_ENTRY * _number(fields, b"count")
+            if op == INDEX:  # writers of 2010 give a length that is too large
+                length = INDEX_ENTRY * _get_number(fields, b"count")
             is_whole = data + length <= size
             if not is_whole and op != CHUNK:
                 raise BrokenBag(CUT_OFF)
-            if op == MESSAGE:  # of a chunk that was not closed
-                self._add_loose(position, data + length - position, _number(fields, b"conn"), _time(fields))
+            if op == MESSAGE:  # it is in a chunk that was not closed
+                self._add_loose(
+                    position, data + length - position, _get_number(fields, b"conn"), _get_time(fields)
+                )
             else:
-                self._take(op, fields, file, length, is_whole)
+                self._read_record(op, fields, file, length, is_whole)
             position = data + length
         if not self._index_position:
             raise BrokenBag("its recording was not closed")
         if self._index_position > size:
             raise BrokenBag("its end is missing")
 
-    def _take(self, op: bytes, fields: Fields, file: BinaryIO, length: int, is_whole: bool) -> None:
-        """Takes in a record of which the file is at the data; those of other kinds are passed over."""
+    def _read_record(self, op: bytes, fields: Fields, file: BinaryIO, length: int, is_whole: bool) -> None:
+        """Read a record; the file is at the record's data. Records of other kinds are skipped."""
         if op == BAG_HEADER:
             self._index_position = int.from_bytes(fields.get(b"index_pos", b""), "little")
             if fields.get(b"encryptor"):
@@ -86,7 +88,7 @@ class Ros1File(ChunkedFile):
                 raise BrokenBag(CUT_OFF)
             fields = read_fields(content[position + 4 : start])
             if fields.get(b"op") == MESSAGE:
-                yield _time(fields), _number(fields, b"conn"), content[data:end]
+                yield _get_time(fields), _get_number(fields, b"conn"), content[data:end]
             elif fields.get(b"op") == CONNECTION:
                 self._add_connection(fields, content[data:end])
             position = end
@@ -96,11 +98,11 @@ class Ros1File(ChunkedFile):
         times = np.frombuffer(entries, "<u4").reshape(-1, INDEX_ENTRY // 4).astype(np.uint64)
         first = int((times[:, 0] * 10**9 + times[:, 1]).min())
         chunk.start = first if chunk.start is None else min(first, chunk.start)
-        chunk.counts[_number(fields, b"conn")] += len(entries) // INDEX_ENTRY
+        chunk.counts[_get_number(fields, b"conn")] += len(entries) // INDEX_ENTRY
 
     def _add_connection(self, fields: Fields, data: bytes | memoryview) -> None:
         about = read_fields(data)
-        self.connections[_number(fields, b"conn")] = Connection(
+        self.connections[_get_number(fields, b"conn")] = Connection(
             topic=fields.get(b"topic", b"").decode(errors="replace"),
             kind=message_type(about.get(b"type", b"").decode(errors="replace")),
             encoding="ros1",
@@ -108,7 +110,7 @@ class Ros1File(ChunkedFile):
 
 
 def read_fields(header: bytes | memoryview) -> Fields:
-    """The fields ``name=value`` of a record's header; what comes after a damaged one is left out.
+    """Parse the fields ``name=value`` of a record's header, up to the first damaged field.
 
     >>> read_fields(bytes([4, 0, 0, 0]) + b"op=!")
     {b'op': b'!'}
@@ -126,21 +128,21 @@ def read_fields(header: bytes | memoryview) -> Fields:
 
 
 def _read_head(file: BinaryIO) -> tuple[Fields, int]:
-    """The fields of a record's header, and the length of the data that come next."""
+    """Read the header of a record; returns its fields and the length of the data that follow."""
     (length,) = UINT32.unpack(read_exactly(file, 4))
     if length > LONGEST_HEADER:
         raise BrokenBag(DAMAGED)
     return read_fields(read_exactly(file, length)), UINT32.unpack(read_exactly(file, 4))[0]
 
 
-def _number(fields: Fields, name: bytes) -> int:
+def _get_number(fields: Fields, name: bytes) -> int:
     try:
         return int(UINT32.unpack(fields[name])[0])
     except (KeyError, struct.error) as error:
         raise BrokenBag(DAMAGED) from error
 
 
-def _time(fields: Fields) -> int:
+def _get_time(fields: Fields) -> int:
     try:
         seconds, nanoseconds = TIME.unpack(fields[b"time"])
     except (KeyError, struct.error) as error:

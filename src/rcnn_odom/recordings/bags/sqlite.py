@@ -1,4 +1,4 @@
-"""Bags of ROS 2 in files of sqlite3 (``.db3``)."""
+"""Reads ROS 2 bags in sqlite3 files (``.db3``)."""
 
 import sqlite3
 from collections import Counter
@@ -12,11 +12,11 @@ MESSAGES = "SELECT CAST(timestamp AS INTEGER), topic_id, data FROM messages"
 
 
 class SqliteFile:
-    """A bag in sqlite3; as :class:`ChunkedFile`.
+    """A bag in an sqlite3 file, with the same attributes and methods as :class:`ChunkedFile`.
 
     Raises:
-        BrokenBag: it cannot be opened.
-        NoBag: it is another database.
+        BrokenBag: the file cannot be opened.
+        NoBag: the database is not a bag.
     """
 
     def __init__(self, path: Path) -> None:
@@ -33,15 +33,18 @@ class SqliteFile:
                 }
                 self._count(database)
         except sqlite3.Error as error:
-            if not self.broken and str(error).startswith("no such "):  # table, or column of it
-                raise NoBag(f"is a database of sqlite3, but no ROS bag ({error})") from error
+            if not self.broken and str(error).startswith("no such "):  # a table or column is missing
+                raise NoBag(f"is a database of sqlite3, but not a ROS bag ({error})") from error
             raise BrokenBag(str(error)) from error
 
     def messages(self, wanted: set[int]) -> Iterator[Message]:
-        """The messages of some connections in the order of their arrival.
+        """Yield the messages of some connections in the order of their arrival.
+
+        Args:
+            wanted: numbers of the connections.
 
         Raises:
-            BrokenBag: the file is damaged; after the last message that can be read.
+            BrokenBag: the file is damaged; raised after the last message that can be read.
         """
         try:
             with closing(_connect(self.path)) as database:
@@ -58,7 +61,10 @@ class SqliteFile:
             yield time, number, _as_bytes(content)
 
     def _until_the_end(self, database: sqlite3.Connection, wanted: set[int]) -> Iterator[Message]:
-        """In the order of writing, since a cut takes the index; where it cut, content reads as zeros."""
+        """Yield messages in the order of writing, because a file that was cut off has no index.
+
+        At the cut, content is read as zeros; so a message is only yielded if another one follows it.
+        """
         complete = None
         for time, number, content in database.execute(f"{MESSAGES} NOT INDEXED"):
             if complete is not None and complete[1] in wanted:
@@ -75,7 +81,7 @@ class SqliteFile:
                 return
             except sqlite3.Error as error:
                 self.broken = str(error)
-        with suppress(sqlite3.Error):  # where the file ends
+        with suppress(sqlite3.Error):  # raised at the end of the file
             for (number,) in database.execute("SELECT topic_id FROM messages NOT INDEXED"):
                 self.counts[number] += 1
 
@@ -85,23 +91,23 @@ def _as_bytes(content: object) -> memoryview:
 
 
 def _is_cut_off(path: Path) -> bool:
-    """Whether a file has fewer pages than its header says."""
+    """Whether a file has fewer pages than its header says, and no log with the rest."""
     with path.open("rb") as file:
         head = file.read(100).ljust(100, b"\0")
     page, pages = int.from_bytes(head[16:18], "big"), int.from_bytes(head[28:32], "big")
-    says_pages = head[24:28] == head[92:96]  # the last writer knew of that field
-    return says_pages and not _log_of(path) and pages * (65536 if page == 1 else page) > path.stat().st_size
+    is_valid = head[24:28] == head[92:96]  # otherwise the last writer did not update the number of pages
+    return is_valid and not _log_of(path) and pages * (65536 if page == 1 else page) > path.stat().st_size
 
 
 def _log_of(path: Path) -> Path | None:
-    """The file beside it with what was not moved into it yet."""
+    """The write-ahead log beside a database, if it has content that is not in the database yet."""
     log = path.with_name(f"{path.name}-wal")
     return log if log.is_file() and log.stat().st_size else None
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Opened so that nothing is written; without a log not even locks beside the file."""
-    # What a recorder that broke off had not moved from its log into the file is read too.
+    """Open a database without writing; if it has no log, even without lock files."""
+    # The log is read too: a recorder that crashed had not moved its content into the database.
     mode = "mode=ro" if _log_of(path) else "mode=ro&immutable=1"
     database = sqlite3.connect(f"{path.resolve().as_uri()}?{mode}", uri=True)
     database.execute("PRAGMA writable_schema = ON")  # also opens a file that was cut off

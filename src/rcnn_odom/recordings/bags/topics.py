@@ -1,22 +1,22 @@
-"""Which topic of a bag holds the scans."""
+"""Chooses the topics of a bag that hold the scans and the odometry."""
 
 from pathlib import Path
 from typing import NamedTuple
 
 from rcnn_odom.errors import InputError
-from rcnn_odom.recordings.bags.files import MENDED_BY, Bag
+from rcnn_odom.recordings.bags.files import REPAIR_ADVICE, Bag
 
 LASER_SCAN, POINT_CLOUD = "sensor_msgs/msg/LaserScan", "sensor_msgs/msg/PointCloud2"
 ODOMETRY, TRANSFORMS = "nav_msgs/msg/Odometry", "tf2_msgs/msg/TFMessage"
 
 
 class Topic(NamedTuple):
-    """What is read of a bag.
+    """A topic of a bag.
 
     Attributes:
-        name: of the topic.
+        name: name of the topic.
         kind: type of its messages.
-        messages: how many there are.
+        messages: number of its messages.
     """
 
     name: str
@@ -25,16 +25,17 @@ class Topic(NamedTuple):
 
 
 def choose_topic(path: Path, bag: Bag, wanted: str | None) -> Topic:
-    """The topic that is to be read.
+    """Choose the topic with the scans.
 
     Args:
-        path: of the bag, for errors.
-        bag: of which the topic is.
-        wanted: its name, with or without its first slash; None: the only one with LaserScan messages, or
-            where there is none with PointCloud2 messages. Without messages it does not count beside others.
+        path: path of the bag, for errors.
+        bag: the bag.
+        wanted: name of the topic, with or without its first slash; None: the only topic with LaserScan
+            messages, or, if there is none, the only one with PointCloud2 messages. Topics without a message
+            are ignored if others have messages.
 
     Raises:
-        InputError: there is none, or several, or its messages are in an encoding that is not ROS's.
+        InputError: there is no such topic, there are several, or the encoding of its messages is not ROS's.
     """
     topics = _list_topics(bag)
     lasers = [topic for topic in topics if topic.kind == LASER_SCAN]
@@ -46,21 +47,21 @@ def choose_topic(path: Path, bag: Bag, wanted: str | None) -> Topic:
         written = [[topic for topic in some if topic.messages] for some in (lasers, clouds)]
         found = written[0] or written[1] or lasers or clouds
     if len(found) != 1:
-        raise _refuse(path, bag, lasers, clouds, wanted, several=found)
+        raise _choice_error(path, bag, lasers, clouds, wanted, several=found)
     _need_known_encoding(path, bag, found[0])
     return found[0]
 
 
 def choose_odometry(path: Path, bag: Bag, wanted: str) -> str:
-    """The topic of a robot's own odometry.
+    """Find the topic of the robot's own odometry; returns its name as in the bag.
 
     Args:
-        path: of the bag, for errors.
-        bag: of which the topic is.
-        wanted: its name, with or without its first slash.
+        path: path of the bag, for errors.
+        bag: the bag.
+        wanted: name of the topic, with or without its first slash.
 
     Raises:
-        InputError: there is none of this name, or its messages are of another type.
+        InputError: there is no topic of this name, or its messages are of another type.
     """
     topics = [topic for topic in _list_topics(bag) if _is_called(topic, wanted)]
     found = [topic for topic in topics if topic.kind == ODOMETRY]
@@ -84,19 +85,19 @@ def _is_called(topic: Topic, name: str) -> bool:
     return topic.name.strip("/") == name.strip("/")
 
 
-def _refuse(
+def _choice_error(
     path: Path, bag: Bag, lasers: list[Topic], clouds: list[Topic], wanted: str | None, several: list[Topic]
 ) -> InputError:
-    """Why no topic, or not one alone, is the one to be read."""
+    """The error if there is not exactly one topic to read."""
     topics = _list_topics(bag)
     if not lasers and not clouds:
         if bag.broken:
-            return InputError(f"{path}: breaks off before any scan ({bag.broken}); {MENDED_BY}")
+            return InputError(f"{path}: breaks off before any scan ({bag.broken}); {REPAIR_ADVICE}")
         others = ", ".join(f"{topic.name} ({topic.kind or 'no type'})" for topic in topics) or "none at all"
         return InputError(f"{path}: no topic with {LASER_SCAN} or {POINT_CLOUD}; its topics: {others}")
     kinds = [topic.kind for topic in topics if wanted and _is_called(topic, wanted)]
     if kinds:
-        wrong = f"{wanted} holds {kinds[0] or 'messages of no type'}, which is no scan"
+        wrong = f"{wanted} holds {kinds[0] or 'messages of no type'}, which is not a scan"
     elif wanted is not None:
         wrong = f"no topic {wanted}"
     else:

@@ -1,4 +1,4 @@
-"""A robot's own odometry in a bag (nav_msgs/Odometry), told for the moments of the scans."""
+"""Reads a robot's own odometry from a bag (nav_msgs/Odometry) and interpolates it at the stamps of scans."""
 
 import math
 from array import array
@@ -16,7 +16,7 @@ from rcnn_odom.recordings.bags.messages import Clock, read_known
 from rcnn_odom.recordings.bags.topics import ODOMETRY, choose_odometry
 
 FARTHEST_IN_TIME = 0.5
-"""Seconds: a pose that was measured further from its scan says nothing about it."""
+"""Seconds; largest time between a scan and the poses that it is interpolated from."""
 
 Planar = tuple[float, float, float]
 """x and y in metres, heading in radians."""
@@ -24,13 +24,13 @@ Planar = tuple[float, float, float]
 
 @dataclass(frozen=True, eq=False)
 class WheelOdometry:
-    """Poses by the robot's own odometry.
+    """Poses from the robot's own odometry.
 
     Attributes:
         stamps: (M,) seconds, ascending.
         poses: (M, 3) x and y in metres, heading in radians.
-        frame: the robot's frame, of which the poses are; empty if unknown.
-        note: in words for the user.
+        frame: the robot's frame, whose poses these are; empty if unknown.
+        note: message for the user.
     """
 
     stamps: FloatArray
@@ -39,11 +39,11 @@ class WheelOdometry:
     note: str
 
     def at(self, stamp: float | None, laser: FloatArray) -> Planar | None:
-        """Where the laser was, between the two poses around it; None: one of them is not near in time.
+        """Interpolate the pose of the laser; None if a pose before or after is missing or too far in time.
 
         Args:
             stamp: seconds; None: unknown.
-            laser: (4, 4) its pose on the robot.
+            laser: (4, 4) pose of the laser on the robot.
         """
         if stamp is None:
             return None
@@ -62,20 +62,20 @@ class WheelOdometry:
 
 
 def read_wheels(path: Path, bag: Bag, wanted: str) -> WheelOdometry:
-    """All poses of a topic with odometry; of each message four numbers are kept.
+    """Read all poses of an odometry topic; only four numbers of each message are kept in memory.
 
     Args:
-        path: of the bag, for errors.
-        bag: to read from.
+        path: path of the bag, for errors.
+        bag: bag to read from.
         wanted: name of the topic.
 
     Raises:
-        InputError: there is no such topic, or not one pose on it.
+        InputError: there is no such topic, or it has no pose that can be read.
     """
     topic = choose_odometry(path, bag, wanted)
     rows, clock, unreadable, frame = array("d"), Clock(), Counter[str](), ""
     for message, arrival in read_known(bag, topic, ODOMETRY, unreadable):
-        stamp, pose = clock.stamp(message, arrival), _planar(message.pose.pose)
+        stamp, pose = clock.stamp(message, arrival), _get_planar_pose(message.pose.pose)
         if stamp is None or not all(map(math.isfinite, pose)):
             unreadable[topic] += 1
             continue
@@ -83,7 +83,7 @@ def read_wheels(path: Path, bag: Bag, wanted: str) -> WheelOdometry:
         rows.extend((stamp, *pose))
     if not rows:
         raise InputError(
-            f"{path}: no pose can be read of {topic}; choose another topic, or leave --odom-topic out"
+            f"{path}: no pose of {topic} can be read; choose another topic, or leave --odom-topic out"
         )
     table = np.frombuffer(rows).reshape(-1, 4)
     stamps, first = np.unique(table[:, 0], return_index=True)
@@ -91,8 +91,8 @@ def read_wheels(path: Path, bag: Bag, wanted: str) -> WheelOdometry:
     return WheelOdometry(stamps, table[first, 1:], frame, f"{len(stamps)} poses of {topic}{lost}")
 
 
-def _planar(pose: Any) -> Planar:
-    """x, y and heading of a message; a heading of nan where its rotation is none."""
+def _get_planar_pose(pose: Any) -> Planar:
+    """x, y and heading of a pose; the heading is nan if the quaternion is not a rotation."""
     at, turn = pose.position, pose.orientation
     sine, cosine = 2 * (turn.w * turn.z + turn.x * turn.y), 1 - 2 * (turn.y**2 + turn.z**2)
     is_rotation = abs(turn.x**2 + turn.y**2 + turn.z**2 + turn.w**2 - 1) < 0.1

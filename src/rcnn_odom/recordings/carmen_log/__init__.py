@@ -1,1 +1,1 @@
-"""What a CARMEN log says: its lines, its parameters, its laser, and the truth."""
+"""Parts of the reader of CARMEN logs: laser lines, PARAM lines, the front laser, and the truth."""

@@ -1,6 +1,6 @@
-"""What one laser line of a CARMEN log says, and whether it agrees with itself.
+"""Parses the laser lines of a CARMEN log and checks that their fields are consistent.
 
-The lines, one blank between fields::
+The format of the lines, one blank between fields::
 
     FLASER n [n ranges] x y theta odom_x odom_y odom_theta ipc_timestamp host logger_timestamp
     ROBOTLASER1 laser_type start_angle field_of_view resolution maximum_range accuracy remission_mode
@@ -26,15 +26,22 @@ from rcnn_odom.recordings.carmen_log.params import OPTION
 from rcnn_odom.recordings.laser_scan import has_most_beyond
 
 OVERLAP = 0.1
-"""Radians: by no more than this do the beams of a laser that turns all round overlap."""
+"""Radians; largest overlap of the beams of a laser that turns all round."""
 NOT_RADIANS = "are its angles in degrees, not radians?"
 
 
 class LaserLine(NamedTuple):
-    """What one laser line says; angles in radians, lengths in metres.
+    """The content of one laser line; angles in radians, lengths in metres.
 
-    The spacing is negative where the beams run clockwise. A maximum that most readings contradict is
-    doubted: it is infinite here, as an unknown one is.
+    Attributes:
+        kind: ``FLASER`` or ``ROBOTLASER1``.
+        readings: (P,) ranges.
+        first_angle: direction of the first beam, counter-clockwise from straight ahead.
+        spacing: angle from beam to beam; negative if the beams run clockwise.
+        maximum: maximum range; infinite if it is unknown, or if most readings lie beyond it.
+        stamp: seconds.
+        laser, robot: [x, y, heading] of the laser's pose, and of the robot's odometry pose.
+        is_maximum_doubted: whether the line's maximum range is not used because most readings lie beyond it.
     """
 
     kind: str
@@ -49,19 +56,23 @@ class LaserLine(NamedTuple):
 
 
 def parse_flaser(fields: list[str], front: FrontLaser) -> LaserLine:
-    """A FLASER line, whose beams lie symmetrically about straight ahead.
+    """Parse a FLASER line; its beams lie symmetrically about straight ahead.
+
+    Args:
+        fields: words of the line.
+        front: the laser's parameters.
 
     Raises:
-        ValueError: it is broken, or its number of readings is not that of the laser.
+        ValueError: the line is broken, or its number of readings does not fit the laser.
     """
-    count = _count(fields, 1)
+    count = _parse_count(fields, 1)
     _need_fields(fields, 2 + count + 9, count)
     if not front.fits(count):
         raise ValueError(
             f"{count} readings, {math.degrees(front.resolution):.4g} degrees apart by the log's PARAM lines, "
-            f"do not cover {math.degrees(front.field_of_view):.4g} degrees; if they do, say so with {OPTION}"
+            f"do not cover {math.degrees(front.field_of_view):.4g} degrees; if they do, set {OPTION}"
         )
-    pose = _finite(fields[2 + count : 9 + count])
+    pose = _parse_finite(fields[2 + count : 9 + count])
     return LaserLine(
         kind=fields[0],
         readings=np.array([float(word) for word in fields[2 : 2 + count]]),
@@ -75,28 +86,31 @@ def parse_flaser(fields: list[str], front: FrontLaser) -> LaserLine:
 
 
 def parse_robotlaser(fields: list[str], _: FrontLaser) -> LaserLine:
-    """A ROBOTLASER1 line, which says itself where its beams lie.
+    """Parse a ROBOTLASER1 line, which holds the directions of its beams itself.
+
+    Args:
+        fields: words of the line.
 
     Raises:
-        ValueError: it is broken, or its angles do not fit each other or its number of readings.
+        ValueError: the line is broken, or its angles contradict each other or its number of readings.
     """
-    count = _count(fields, 8)
+    count = _parse_count(fields, 8)
     _need_fields(fields, 10 + count, count, exact=False)
     remissions = int(fields[9 + count])
     _need_fields(fields, 24 + count + remissions, count)
-    spacing, maximum = _spacing(fields[3], fields[4], count), float(fields[5])
+    spacing, maximum = _compute_spacing(fields[3], fields[4], count), float(fields[5])
     readings = np.array([float(word) for word in fields[9 : 9 + count]])
     doubted = maximum > 0 and has_most_beyond(readings, maximum)
-    poses = _finite(fields[10 + count + remissions : 16 + count + remissions])
+    poses = _parse_finite(fields[10 + count + remissions : 16 + count + remissions])
     return LaserLine(
         kind=fields[0],
         readings=readings,
-        first_angle=_start_angle(fields[2]),
+        first_angle=_parse_start_angle(fields[2]),
         spacing=spacing,
         maximum=maximum if maximum > 0 and not doubted else math.inf,
         laser=poses[:3],
         robot=poses[3:],
-        stamp=_finite(fields[-3:-2])[0],
+        stamp=_parse_finite(fields[-3:-2])[0],
         is_maximum_doubted=doubted,
     )
 
@@ -104,25 +118,25 @@ def parse_robotlaser(fields: list[str], _: FrontLaser) -> LaserLine:
 PARSERS = {"FLASER": parse_flaser, "ROBOTLASER1": parse_robotlaser}
 
 
-def _start_angle(word: str) -> float:
-    [angle] = _finite([word])
+def _parse_start_angle(word: str) -> float:
+    [angle] = _parse_finite([word])
     if abs(angle) > CIRCLE:
         raise ValueError(f"a start angle of {angle:g} is more than 2 pi; {NOT_RADIANS}")
     return angle
 
 
-def _spacing(fov_word: str, resolution_word: str, count: int) -> float:
-    """Radians from beam to beam, counter-clockwise, from what a line says of them.
+def _compute_spacing(fov_word: str, resolution_word: str, count: int) -> float:
+    """Radians from beam to beam, counter-clockwise, by the fields of a line.
 
-    The sign is that of the resolution, and of the field of view only where there is no resolution.
+    The sign is that of the resolution, or that of the field of view if the resolution is 0.
 
     Raises:
-        ValueError: field of view, resolution and number of readings do not fit.
+        ValueError: the field of view, the resolution and the number of readings contradict each other.
     """
-    field_of_view, resolution = _finite([fov_word, resolution_word])
+    field_of_view, resolution = _parse_finite([fov_word, resolution_word])
     extent, step = (0.0 if abs(value) < PRINTED else abs(value) for value in (field_of_view, resolution))
     rounding = rounding_of(resolution_word) if step else 0.0
-    if fault := _misfit(extent, step, count, rounding):
+    if fault := _find_misfit(extent, step, count, rounding):
         raise ValueError(
             f"a field of view of {field_of_view:g} and a resolution of {resolution:g} do not fit {count} "
             f"readings: {fault}"
@@ -134,24 +148,24 @@ def _spacing(fov_word: str, resolution_word: str, count: int) -> float:
     return math.copysign(step, resolution)
 
 
-def _misfit(extent: float, step: float, count: int, rounding: float) -> str:
-    """Why a field of view and a resolution (radians, 0: unknown) cannot be; empty where they can."""
+def _find_misfit(extent: float, step: float, count: int, rounding: float) -> str:
+    """Why a field of view and a resolution (radians, 0: unknown) cannot be right; empty if they can."""
     covered = step * (count - 1)
     if not extent and not step:
         return "both are 0; write at least one of them"
     if extent > CIRCLE + min(step, OVERLAP):
         return f"the field of view is more than 2 pi; {NOT_RADIANS}"
     if extent and step > extent and count > 1:
-        return f"the resolution is above the field of view{_unit(extent, step, count)}"
+        return f"the resolution is above the field of view{_guess_mistake(extent, step, count)}"
     if extent and step and not agree(extent, step, count, rounding):
-        return f"{count - 1} times the resolution is {covered:g}{_unit(extent, step, count)}"
+        return f"{count - 1} times the resolution is {covered:g}{_guess_mistake(extent, step, count)}"
     if covered > CIRCLE + min(step, OVERLAP):
         return f"{count - 1} times the resolution is {covered:g}, more than 2 pi; {NOT_RADIANS}"
     return ""
 
 
-def _unit(extent: float, step: float, count: int) -> str:
-    """What was perhaps written in place of a resolution in radians."""
+def _guess_mistake(extent: float, step: float, count: int) -> str:
+    """A guess at what was written in place of a resolution in radians; empty if there is none."""
     if agree(extent, math.radians(step), count):
         return "; is the resolution in degrees, not radians?"
     if step in (count - 1, count, count + 1):
@@ -159,7 +173,7 @@ def _unit(extent: float, step: float, count: int) -> str:
     return ""
 
 
-def _count(fields: list[str], at: int) -> int:
+def _parse_count(fields: list[str], at: int) -> int:
     if len(fields) <= at:
         raise ValueError("it ends before the number of readings")
     count = int(fields[at])
@@ -173,7 +187,7 @@ def _need_fields(fields: list[str], expected: int, count: int, exact: bool = Tru
         raise ValueError(f"it announces {count} readings, so {expected} fields, but has {len(fields)}")
 
 
-def _finite(words: list[str]) -> list[float]:
+def _parse_finite(words: list[str]) -> list[float]:
     values = [float(word) for word in words]
     if not np.isfinite(values).all():
         raise ValueError(f"not a finite number among {' '.join(words)}")

@@ -1,4 +1,4 @@
-"""Where a robot was: the poses of a CARMEN log itself, its wheel odometry, or a reference beside it."""
+"""True poses of a robot from a CARMEN log or from a reference file, and the log's wheel odometry."""
 
 from collections.abc import Iterable
 from pathlib import Path
@@ -11,14 +11,14 @@ from rcnn_odom.recordings.carmen_log.lines import LaserLine
 from rcnn_odom.recordings.trajectory import read_lines
 
 ENDINGS = (".gz", ".bz2", ".xz", ".zst", ".log", ".clf")
-"""What a reference leaves out of the name of its log; packings first."""
+"""Suffixes of a log's name that are not part of its reference's name, compressions first."""
 REFERENCE_COLUMNS = ("raw_scan_index", "ref_x", "ref_y", "ref_theta")
 
 
 def laser_on_robot(line: LaserLine) -> FloatArray:
-    """Where the laser sits (4, 4) on the robot whose odometry lines like this one have.
+    """Pose (4, 4) of the laser in the frame of the log's odometry, from one line of the log.
 
-    On ROBOTLASER1 lines the odometry is the robot's, on FLASER lines it is taken as the laser's own.
+    On ROBOTLASER1 lines, the odometry is the robot's. On FLASER lines, it is taken to be the laser's own.
     """
     if line.kind != "ROBOTLASER1":
         return np.eye(4)
@@ -28,12 +28,12 @@ def laser_on_robot(line: LaserLine) -> FloatArray:
 
 
 def wheel_odometry(lines: Iterable[LaserLine], mount: FloatArray) -> FloatArray:
-    """Poses (N, 4, 4) of the laser by the robot's wheels; ``mount`` as of :func:`laser_on_robot`."""
+    """Poses (N, 4, 4) of the laser from wheel odometry; ``mount`` is the result of :func:`laser_on_robot`."""
     return planar_to_poses([line.robot for line in lines]) @ mount
 
 
-def name_truth(lines: list[LaserLine]) -> list[str]:
-    """Words about the log's own poses as a truth."""
+def describe_truth(lines: list[LaserLine]) -> list[str]:
+    """Notes about the log's own poses as truth: a warning if they equal the wheel odometry."""
     difference = np.array([line.laser for line in lines]) - np.array([line.robot for line in lines])
     difference[:, 2] = wrap_angle(difference[:, 2])
     truth = "truth: the log's laser pose"
@@ -47,14 +47,14 @@ def name_truth(lines: list[LaserLine]) -> list[str]:
 
 
 def find_reference(reference: Path, name: str) -> Path:
-    """The table that is a log's reference.
+    """Find the table with a log's reference.
 
     Args:
         reference: the table, or a folder that holds ``NAME_dense_ref.csv``.
-        name: of the log.
+        name: name of the log.
 
     Raises:
-        InputError: there is none.
+        InputError: there is no such table.
     """
     if reference.is_dir():
         stem = name
@@ -69,10 +69,14 @@ def find_reference(reference: Path, name: str) -> Path:
 
 
 def read_truth(path: Path, scans: int) -> tuple[FloatArray, list[str]]:
-    """Poses (scans, 4, 4) of a reference, nan where it has none, and notes on them.
+    """Read a reference: poses (scans, 4, 4), nan where the truth is unknown, and notes about them.
+
+    Args:
+        path: path of the table.
+        scans: number of scans of the log.
 
     Raises:
-        InputError: it cannot be read, or is not about so many scans.
+        InputError: the table cannot be read, or has another number of rows than the log has scans.
     """
     planar = _read_reference(path, scans)
     poses, unknown = planar_to_poses(planar), np.isnan(planar[:, 0])
@@ -81,9 +85,9 @@ def read_truth(path: Path, scans: int) -> tuple[FloatArray, list[str]]:
 
 
 def _read_reference(path: Path, scans: int) -> FloatArray:
-    """x, y and heading of every scan, (scans, 3); a row with any nan is nan as a whole."""
+    """x, y and heading of every scan, (scans, 3); a row that contains a nan becomes nan as a whole."""
     lines = read_lines(path, f"give a table with the columns {', '.join(REFERENCE_COLUMNS)}")
-    # Remarks follow some names in parentheses: "raw_scan_index(in ...)".
+    # Some column names are followed by a remark in parentheses: "raw_scan_index(in ...)".
     header = [word.split("(")[0].strip() for word in lines[0].lstrip("# ").split(",")]
     missing = [column for column in REFERENCE_COLUMNS if column not in header]
     if missing:

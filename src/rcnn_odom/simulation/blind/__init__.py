@@ -1,1 +1,1 @@
-"""Places where a matcher has little to hold on to: road tunnels, bare corridors, open ground."""
+"""Places with little information for scan matching: road tunnels, bare corridors, open ground."""

@@ -1,4 +1,4 @@
-"""A drive through a tunnel, along a bare corridor or over open ground: walls and poses."""
+"""Drives through a tunnel, along a bare corridor or over open ground: walls and poses."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -14,30 +14,31 @@ from rcnn_odom.simulation.scene import Walls
 from rcnn_odom.simulation.street.polyline import unit
 from rcnn_odom.simulation.street.smooth import meander, random_waves
 from rcnn_odom.simulation.street.sway import sway
-from rcnn_odom.simulation.terrain import Ground, flat_ground, stand
+from rcnn_odom.simulation.terrain import Ground, flat_ground, place_on_ground
 
 BEYOND = 100.0
-"""Metres of the place before the drive and after it: more than the laser sees."""
+"""Metres by which a place continues before and after the drive, farther than the range of the laser."""
 CAR_LASER = (0.75, 1.0)
 ROBOT_LASER = (0.0, 0.25)
-"""Metres of the laser ahead of the axle."""
+"""Metres from the axle forward to the laser."""
 ROAD_ROUGHNESS = (0.5, 1.0)
+"""Roughness of the road, 1 is usual in a town."""
 CAR_HEIGHT = 1.73
-"""Metres of a car's laser above the road."""
+"""Metres, height of a car's laser above the road."""
 
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of place and who drives there.
+    """A kind of place, and the vehicle that drives there. Pairs of numbers are ranges of uniform draws.
 
     Attributes:
-        lay_out: the way from its length and random numbers.
-        build: what stands along it, from the way, its length and random numbers.
-        pace: how fast it is driven.
-        aside: metres to the left of the way that a drive keeps on average, drawn evenly.
-        straying: metres by which it strays from there, drawn evenly ...
-        waves: ... in waves of so many metres.
-        is_car: on springs, over ground, with a high laser; otherwise a robot whose laser looks level.
+        lay_out: makes the way from its length and a random generator.
+        build: makes the walls from the way, its length and a random generator.
+        pace: speeds of the vehicle.
+        aside: metres, mean offset of a drive to the left of the way.
+        straying: metres, amplitude of a drive's deviation from that offset.
+        waves: metres, wavelengths of this deviation.
+        is_car: True: a car on springs, on the ground, with a high laser. False: a robot with a level laser.
     """
 
     lay_out: Callable[[float, np.random.Generator], Way]
@@ -68,7 +69,7 @@ KINDS = {
         _lay_out_track, places.open_ground, CAR_ON_A_TRACK, (-0.3, 0.3), (0.1, 0.4), (20.0, 80.0), True
     ),
 }
-"""By what the name of a drive begins with."""
+"""Kinds of places by the beginning of a drive's name."""
 
 
 @dataclass(frozen=True)
@@ -77,8 +78,8 @@ class BlindDrive:
 
     Attributes:
         poses: (N, 4, 4) laser to world.
-        walls: what stands there.
-        ground: under a car.
+        walls: walls of the place.
+        ground: ground under a car; None for a robot.
     """
 
     poses: FloatArray
@@ -87,26 +88,29 @@ class BlindDrive:
 
 
 def kind_of(name: str) -> Kind:
-    """The kind of place that the name of a drive stands for: what comes before its first ``-``.
+    """The kind of place that the name of a drive begins with, before the first ``-``.
 
     Raises:
-        InputError: it is none.
+        InputError: there is no such kind.
+
+    >>> kind_of("tunnel-1").is_car
+    True
     """
     kind = KINDS.get(name.split("-")[0])
     if kind is None:
         begins = ", ".join(f"{each}-1" for each in KINDS)
-        raise InputError(f"simulated sequence {name}: no drive of data.world=blind; name it like {begins}")
+        raise InputError(f"simulated sequence {name}: not a name in data.world=blind; name it like {begins}")
     return kind
 
 
 def blind_drive(kind: Kind, stamps: FloatArray, tilts: bool, rng: np.random.Generator) -> BlindDrive:
-    """Another drive and another place for every draw from ``rng``.
+    """Make a random place and a drive through it.
 
     Args:
-        kind: of the place.
+        kind: kind of the place.
         stamps: (N,) seconds of the frames, evenly spaced.
-        tilts: a car leans on its springs.
-        rng: where all chance comes from.
+        tilts: whether a car pitches and rolls on its springs.
+        rng: source of all random choices.
     """
     way_rng, place_rng, pace_rng, body_rng = rng.spawn(4)
     driven = travel(kind.pace, stamps, pace_rng)
@@ -119,23 +123,34 @@ def blind_drive(kind: Kind, stamps: FloatArray, tilts: bool, rng: np.random.Gene
     aside = speed * np.gradient(planar[:, 2], stamps)
     tilt = sway(speed, aside, body_rng.uniform(*ROAD_ROUGHNESS), body_rng)[:, :2]
     ground = flat_ground(way.points.min(0) - BEYOND, way.points.max(0) + BEYOND)
-    return BlindDrive(stand(planar, tilt if tilts else 0 * tilt, CAR_HEIGHT, ground), walls, ground)
+    return BlindDrive(place_on_ground(planar, tilt if tilts else 0 * tilt, CAR_HEIGHT, ground), walls, ground)
 
 
 def _drive_along(
     way: Way, along: FloatArray, stamps: FloatArray, kind: Kind, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """Laser's x, y and heading (N, 3) in metres and radians, and the speed (N,) in metres a second."""
-    keeps, straying, waves = (
+    """Drive along a way.
+
+    Args:
+        way: the way.
+        along: (N,) metres along the way.
+        stamps: (N,) seconds.
+        kind: kind of the place.
+        rng: source of all random choices.
+
+    Returns:
+        x, y and heading of the laser (N, 3) in metres and radians, and speed (N,) in metres per second.
+    """
+    offset, straying, waves = (
         rng.uniform(*kind.aside),
         rng.uniform(*kind.straying),
         random_waves(kind.waves, rng),
     )
 
     def line(at: FloatArray) -> FloatArray:
-        return way.place(at, keeps + straying * meander(at, waves))
+        return way.place(at, offset + straying * meander(at, waves))
 
-    # Where the wheels roll is where they go to, also at rest.
+    # The heading is the direction of the line, which is also defined while the vehicle stands.
     ahead = line(along + 0.05) - line(along - 0.05)
     heading = np.unwrap(np.arctan2(ahead[:, 1], ahead[:, 0]))
     lever = rng.uniform(*(CAR_LASER if kind.is_car else ROBOT_LASER))

@@ -1,4 +1,4 @@
-"""How fast a car or a robot goes: stretches at other speeds, and now and then a stop."""
+"""Speed of a car or a robot over time: stretches at different speeds, and sometimes a stop."""
 
 from dataclasses import dataclass
 
@@ -8,24 +8,24 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.street.smooth import average_twice, meander, random_waves
 
 TICK = 0.05
-"""Seconds between two looks at the speed."""
+"""Seconds, time step of the computed speed."""
 JERK_TIME = 0.5
-"""Seconds over which the speed is averaged twice: no pedal is pressed at once."""
+"""Seconds of the window over which the speed is averaged twice, to limit the jerk."""
 UNSTEADY, UNSTEADY_WAVES = 0.08, (4.0, 25.0)
-"""Share by which no speed is ever kept exactly, and seconds over which it strays."""
+"""Relative amplitude of slow variations of the speed, and range of their periods in seconds."""
 
 
 @dataclass(frozen=True)
 class Pace:
-    """What a drive and each of its stretches draw from, all evenly.
+    """Ranges of the uniform draws for a drive and for each of its stretches.
 
     Attributes:
-        fastest: metres a second that a drive has in mind.
-        share: of it in a stretch.
-        stretch: seconds for which a speed is kept, the change to it included.
-        stop_chance: that a stretch is a stop.
-        stop: seconds of it, braking included.
-        speeding_up, braking: m/s^2 of a stretch.
+        fastest: metres per second, top speed of a drive.
+        share: speed of a stretch as a part of the top speed.
+        stretch: seconds, duration of a stretch, including the change to its speed.
+        stop_chance: probability that a stretch is a stop.
+        stop: seconds, duration of a stop, including braking.
+        speeding_up, braking: m/s^2, accelerations in a stretch.
     """
 
     fastest: tuple[float, float]
@@ -38,15 +38,24 @@ class Pace:
 
 
 CAR = Pace((9.0, 19.0), (0.3, 1.0), (4.0, 15.0), 0.1, (6.0, 12.0), (0.6, 2.0), (0.8, 3.0))
-"""In a tunnel of a city, at 30 to 70 km/h, behind others who slow down and at times stand."""
+"""A car in a city tunnel, at 30 to 70 km/h, behind other cars that slow down and sometimes stop."""
 CAR_ON_A_TRACK = Pace((4.0, 9.0), (0.3, 1.0), (3.0, 12.0), 0.08, (4.0, 10.0), (0.5, 1.5), (0.8, 2.5))
-"""On a gravel track, at 15 to 30 km/h."""
+"""A car on a gravel track, at 15 to 30 km/h."""
 ROBOT = Pace((1.0, 1.6), (0.3, 1.0), (3.0, 12.0), 0.15, (3.0, 8.0), (0.3, 0.8), (0.4, 1.0))
-"""One that carries things through a large building; it waits at doors and for people."""
+"""A transport robot in a large building, which waits at doors and for people."""
 
 
 def travel(pace: Pace, stamps: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Metres driven since the first of some moments (N,), rising from 0; seconds in, (N,) metres out."""
+    """Simulate the distance driven.
+
+    Args:
+        pace: ranges of the speeds.
+        stamps: (N,) seconds, increasing.
+        rng: source of all random choices.
+
+    Returns:
+        Metres (N,) driven since the first stamp.
+    """
     window = round(JERK_TIME / TICK)
     count = int(np.ceil((stamps[-1] - stamps[0]) / TICK)) + 2 * window
     fastest = rng.uniform(*pace.fastest)

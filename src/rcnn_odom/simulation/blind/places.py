@@ -1,4 +1,4 @@
-"""What stands along a way: a tunnel's lining, a corridor's walls, poles and bushes on open ground."""
+"""Walls along a way: the lining of a tunnel, the walls of a corridor, poles and bushes on open ground."""
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,44 +11,55 @@ from rcnn_odom.simulation.street.street import TRUNK, Side
 
 CONCRETE = Material(returned=0.99, roughness=0.01)
 TUNNEL_HEIGHTS = (-1.0, 6.0)
+"""Metres, bottom and top of a tunnel's walls."""
 PIECE = 1.0
-"""Metres, longest straight wall: with longer ones a smooth bend would have corners to hold on to."""
+"""Metres, longest straight piece of a wall; longer pieces would give smooth bends corners to match."""
 
 TUNNEL_WIDTH = (8.5, 10.5)
-"""Two lanes and a walkway at each side."""
+"""Metres: two lanes and a walkway on each side."""
 TUNNEL_FEATURES = (25.0, 60.0)
-"""Metres from one thing on the walls to the next, on either side."""
+"""Metres from one feature of the walls to the next, on both sides together."""
 NICHE = (1.0, 2.5), (0.5, 1.2)
-"""Metres of a niche for a telephone or a hydrant, or of a door: along the wall, and deep."""
+"""Metres, length along the wall and depth of a niche for a telephone or a hydrant, or of a door."""
 PILLAR = (0.4, 1.0), (-0.4, -0.15)
+"""Metres, length along the wall and depth of a pillar; the depth is negative because it protrudes."""
 BAY = (30.0, 45.0), (2.5, 3.2)
-"""A bay for cars that break down, whose ends are slanted by ``BAY_TAPER`` metres."""
+"""Metres, length and depth of a bay for broken-down cars; its ends are slanted over ``BAY_TAPER`` metres."""
 BAY_TAPER = 6.0
 NICHES, PILLARS = 0.55, 0.35
-"""Their shares of all things on the walls; the rest are bays."""
+"""Parts of all features that are niches and pillars; the rest are bays."""
 
 CORRIDOR_WIDTH = (2.0, 3.2)
+"""Metres."""
 DOORS = (5.0, 15.0)
 """Metres from one door to the next on the same side."""
 DOOR, FRAME = (0.85, 1.2), (0.06, 0.1)
-"""Metres along the wall of a leaf and of each side of its frame."""
+"""Metres along the wall of a leaf, and of each side of its frame."""
 FRAME_DEPTH, LEAF_DEPTH = (-0.04, -0.01), (0.01, 0.06)
-"""Metres by which a frame stands out and its closed leaf stands back."""
+"""Metres of depth: a frame protrudes (negative), its closed leaf is recessed."""
 
 POLES = (25.0, 50.0)
-"""Metres from one snow pole to the next, at both sides of the track."""
+"""Metres from one snow pole to the next, on both sides of the track."""
 POLE_ASIDE, POLE_RADIUS, POLES_GONE = (2.5, 5.0), (0.03, 0.06), 0.15
+"""Metres from the track to a pole, radius of a pole in metres, and part of the poles that are missing."""
 BUSHES = (1 / 4000, 1 / 1200)
-"""Bushes and lonely posts a square metre."""
+"""Bushes and single posts per square metre."""
 SIGHT, CLEAR = 85.0, 4.0
-"""Metres from the track within which they stand, a little more than the laser sees, and which are free."""
+"""Metres from the track: bushes stand within ``SIGHT``, slightly more than the laser's range; nothing stands
+within ``CLEAR``."""
 
 Feature = tuple[float, float, float, float]
-"""Where it begins and ends along the wall, by how much it stands back, and how long its ends are; metres."""
+"""Start and end along the wall, depth (negative: it protrudes), and length of its slanted ends; metres."""
 
 
 def tunnel(way: Way, length: float, rng: np.random.Generator) -> Walls:
-    """Two smooth walls, as far apart as two lanes need, with something on either every 25 to 60 metres."""
+    """Two smooth walls of a tunnel with two lanes; there is a feature on one of them every 25 to 60 metres.
+
+    Args:
+        way: the way through the tunnel.
+        length: metres of the way that have walls.
+        rng: source of all random choices.
+    """
     half = rng.uniform(*TUNNEL_WIDTH) / 2
     features: tuple[list[Feature], list[Feature]] = ([], [])
     along = rng.uniform(0, TUNNEL_FEATURES[1])
@@ -64,13 +75,13 @@ def tunnel(way: Way, length: float, rng: np.random.Generator) -> Walls:
 
 
 def corridor(way: Way, length: float, rng: np.random.Generator) -> Walls:
-    """Two flat walls with a closed door in its frame every 5 to 15 metres on either side."""
+    """Two flat walls of a corridor, each with a closed door every 5 to 15 m; arguments as :func:`tunnel`."""
     half = rng.uniform(*CORRIDOR_WIDTH) / 2
     sides = []
     for aside in (half, -half):
         features: list[Feature] = []
         along = rng.uniform(0, DOORS[1])
-        # One carpenter made them all.
+        # All doors of a side have the same frames.
         frame, out, back = rng.uniform(*FRAME), rng.uniform(*FRAME_DEPTH), rng.uniform(*LEAF_DEPTH)
         while along < length - DOORS[0]:
             first, last = along + frame, along + frame + rng.uniform(*DOOR)
@@ -81,7 +92,7 @@ def corridor(way: Way, length: float, rng: np.random.Generator) -> Walls:
 
 
 def open_ground(way: Way, length: float, rng: np.random.Generator) -> Walls:
-    """Snow poles along a track, some of them gone, and a bush or a post here and there."""
+    """Snow poles along a track, some missing, and a few bushes and posts; arguments as :func:`tunnel`."""
     drawn = Side(rng, length, SIGHT)
     spacing, aside = rng.uniform(*POLES), rng.uniform(*POLE_ASIDE)
     for side in (aside, -aside):
@@ -110,14 +121,23 @@ def _wall(
     material: Material,
     heights: tuple[float, float],
 ) -> Walls:
-    """A wall beside a way, negative to the right of it, drawn in short pieces from corner to corner."""
+    """Draw a wall beside a way in short pieces.
+
+    Args:
+        way: the way.
+        length: metres of the way that have a wall.
+        aside: metres from the way to the wall; negative: on the right.
+        features: features of the wall, in order.
+        material: material of the wall.
+        heights: metres, bottom and top of the wall.
+    """
     out = np.sign(aside)
     corners: list[tuple[float, float]] = [(0.0, aside)]
     for start, end, depth, taper in features:
         back = aside + out * depth
         corners += [(start, aside), (start + taper, back), (end - taper, back), (end, aside)]
     corners.append((length, aside))
-    line = _in_pieces(np.array(corners))
+    line = _add_points(np.array(corners))
     placed = way.place(line[:, 0], line[:, 1])
     count = len(line) - 1
     return Walls(
@@ -128,8 +148,8 @@ def _wall(
     )
 
 
-def _in_pieces(corners: FloatArray) -> FloatArray:
-    """The corners (K, 2) of a line with points between them, none farther than ``PIECE`` from the next."""
+def _add_points(corners: FloatArray) -> FloatArray:
+    """Add points to a line with corners (K, 2), so that neighbouring points are at most ``PIECE`` apart."""
     away = np.hypot(*np.diff(corners, axis=0).T)
     kept = np.concatenate([[True], away > 0])
     corners, away = corners[kept], away[kept[1:]]

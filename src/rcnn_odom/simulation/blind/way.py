@@ -1,4 +1,4 @@
-"""The line that a tunnel, a corridor or a track follows, and what lies beside it."""
+"""The line that a tunnel, a corridor or a track follows."""
 
 from dataclasses import dataclass
 
@@ -11,9 +11,9 @@ from rcnn_odom.simulation.street.smooth import average_twice
 STEP = 0.5
 """Metres between the points of a way."""
 EASING = 20.0
-"""Metres over which a bend begins and ends, averaged over twice."""
+"""Metres of the window over which the curvature is averaged twice, so that bends begin and end smoothly."""
 MOST_TURNED = 1.0
-"""Radians from the first direction, from which on the next bend leads back: no way crosses itself."""
+"""Radians from the first direction; beyond it, the next bend turns back, so that no way crosses itself."""
 
 
 @dataclass(frozen=True)
@@ -23,25 +23,28 @@ class Way:
     Attributes:
         points: (M, 2) metres.
         directions: (M,) radians, not wrapped.
+
+    >>> straight_way(10.0).place(np.array([4.0]), np.array([1.0])).tolist()
+    [[4.0, 1.0]]
     """
 
     points: FloatArray
     directions: FloatArray
 
     def place(self, along: FloatArray, aside: FloatArray) -> FloatArray:
-        """Points (..., 2) so many metres along the way and to its left, both (...)."""
+        """Points (..., 2) at distances along the way and offsets to its left, both (...) in metres."""
         at = STEP * np.arange(len(self.points))
         direction = self.direction(along)
         on = np.stack([np.interp(along, at, values) for values in self.points.T], axis=-1)
         return on + np.asarray(aside)[..., None] * unit(direction + np.pi / 2)
 
     def direction(self, along: FloatArray) -> FloatArray:
-        """Radians of the way so many metres along it."""
+        """Directions (...) of the way in radians at distances along it, (...) in metres."""
         return np.interp(along, STEP * np.arange(len(self.points)), self.directions)
 
 
 def straight_way(length: float) -> Way:
-    """A way along x."""
+    """A way along x of ``length`` metres."""
     along = STEP * np.arange(int(length / STEP) + 2)
     return Way(np.stack([along, np.zeros_like(along)], axis=1), np.zeros_like(along))
 
@@ -53,14 +56,14 @@ def bending_way(
     straight: float,
     rng: np.random.Generator,
 ) -> Way:
-    """Straight pieces and bends, as roads are laid out.
+    """A random way of straight sections and bends, as roads have them.
 
     Args:
         length: metres.
-        radii: metres of the tightest and of the widest bend.
-        sections: metres of the shortest and of the longest piece.
-        straight: chance that a piece is straight.
-        rng: decides everything.
+        radii: metres, smallest and largest radius of a bend.
+        sections: metres, length of the shortest and of the longest section.
+        straight: probability that a section is straight.
+        rng: source of all random choices.
     """
     window = round(EASING / STEP)
     count = int(length / STEP) + 2

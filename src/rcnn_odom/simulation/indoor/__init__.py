@@ -1,1 +1,1 @@
-"""A building, its furniture and people, and a robot that drives through."""
+"""A building with furniture and people, and a robot that drives through it."""

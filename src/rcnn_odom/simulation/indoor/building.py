@@ -1,7 +1,7 @@
-"""The inside of a generated building: corridors, rooms and furniture.
+"""Generates a building: corridors, rooms and furniture.
 
-Blocks of rooms stand between corridors that cross at right angles; some blocks are halls. Walls lie on
-whole decimetres, so that the floor's map (a cell a decimetre) is exact about them.
+Blocks of rooms lie between corridors that cross at right angles; some blocks are halls. Walls lie on whole
+decimetres, so the floor map, whose cells are a decimetre wide, represents them exactly.
 """
 
 from collections.abc import Sequence
@@ -17,18 +17,24 @@ from rcnn_odom.simulation.indoor.furniture import furnish_room
 from rcnn_odom.simulation.scene import Walls
 
 WALL_THICKNESS = 0.2
+"""Metres."""
 
 
 @dataclass(frozen=True)
 class Building:
-    """All that stands in a building, and where there is room between it."""
+    """A building.
+
+    Attributes:
+        standing: walls, doors and furniture.
+        floor: map of the free space.
+    """
 
     standing: Walls
     floor: Floor
 
 
 def plan_building(rng: np.random.Generator) -> Building:
-    """A floor of 3 to 6 by 2 to 3 blocks, with furniture, some doors closed and some walls of glass."""
+    """A random floor of 3 to 6 by 2 to 3 blocks with furniture, some closed doors and some glass walls."""
     drawing = Drawing({PLASTER: [], WOOD: [], GLASS: []}, [], [], [])
     columns = _blocks_and_corridors(rng.uniform(8, 20, rng.integers(3, 7)), rng)
     depths = rng.uniform(4, 7, rng.integers(2, 4))
@@ -37,14 +43,14 @@ def plan_building(rng: np.random.Generator) -> Building:
     for i, (left, right) in enumerate(columns):
         for j, (bottom, top) in enumerate(rows):
             rim = (i == 0, i == len(columns) - 1, j == 0, j == len(rows) - 1)
-            _draw_block(drawing, _set_back((left, right, bottom, top), rim, rng), rim, rng)
+            _draw_block(drawing, _shrink_block((left, right, bottom, top), rim, rng), rim, rng)
     _draw_corridors(drawing, columns, rows, rng)
     walls = as_walls(drawing)
     return Building(walls, map_floor(walls, (columns[-1][1], rows[-1][1])))
 
 
 def _blocks_and_corridors(sizes: FloatArray, rng: np.random.Generator) -> list[tuple[float, float]]:
-    """Where every block begins and ends, with corridors of 1.5 to 2.5 metres between them."""
+    """Start and end in metres of each block, with corridors of 1.5 to 2.5 metres between them."""
     widths = rng.triangular(1.5, 1.8, 2.5, len(sizes))
     starts = 1 + np.concatenate([[0], np.cumsum(sizes + widths)[:-1]])
     return [
@@ -56,10 +62,19 @@ def _decimetres(metres: float) -> float:
     return round(float(metres), 1)
 
 
-def _set_back(
+def _shrink_block(
     sides: tuple[float, ...], rim: tuple[bool, ...], rng: np.random.Generator
 ) -> tuple[float, float, float, float]:
-    """A block whose sides on a corridor may stand back a little: no corridor is even all along."""
+    """Move some sides of a block away from their corridors, so that corridors have no constant width.
+
+    Args:
+        sides: left, right, bottom and top in metres.
+        rim: whether each side is at the rim of the building, without a corridor.
+        rng: source of all random choices.
+
+    Returns:
+        Left, right, bottom and top in metres.
+    """
     back = rng.choice([0, 0, 0, 0.1, 0.2, 0.5], 4) * ~np.array(rim) * (1, -1, 1, -1)
     left, right, bottom, top = (_decimetres(side + by) for side, by in zip(sides, back, strict=True))
     return left, right, bottom, top
@@ -71,7 +86,7 @@ def _draw_block(
     rim: tuple[bool, ...],
     rng: np.random.Generator,
 ) -> None:
-    """A hall, or rooms in one row or in two back to back, each with a door to its corridor."""
+    """Draw a hall, or rooms in one row or in two rows back to back, each with a door to its corridor."""
     left, right, bottom, top = sides
     hall = rng.random() < 0.08
     rooms: list[Room] = []
@@ -102,7 +117,7 @@ def _rows_of_rooms(
     hall: bool,
     rng: np.random.Generator,
 ) -> list[tuple[float, float, bool]]:
-    """Lower and upper wall of every row of rooms in a block, and whether their doors are in the upper one."""
+    """For each row of rooms in a block: lower and upper wall, and whether the doors are in the upper wall."""
     low, high = _decimetres(bottom + WALL_THICKNESS), _decimetres(top - WALL_THICKNESS)
     if hall or no_corridor_below or no_corridor_above or high - low < 7:
         upper = no_corridor_below or (not no_corridor_above and rng.random() < 0.5)
@@ -114,7 +129,7 @@ def _rows_of_rooms(
 def _widths_of_rooms(
     left: float, right: float, hall: bool, rng: np.random.Generator
 ) -> list[tuple[float, float]]:
-    """Where every room of a row begins and ends: offices of 2.8 to 4.2 metres, others of 4.5 to 8."""
+    """Start and end in metres of each room of a row: offices are 2.8 to 4.2 metres wide, others 4.5 to 8."""
     low, end = _decimetres(left + WALL_THICKNESS), _decimetres(right - WALL_THICKNESS)
     rooms = []
     while not hall:
@@ -129,7 +144,7 @@ def _widths_of_rooms(
 def _doors_of_row(
     row: Sequence[Room], block: tuple[float, float], upper: bool, hall: bool, rng: np.random.Generator
 ) -> list[Door]:
-    """A door of every room to the corridor, and some from room to room."""
+    """A door from each room to the corridor, and some doors from room to room."""
     doors = []
     for room in row:
         faces = (block[1], room.high[1]) if upper else (block[0], room.low[1])
@@ -147,7 +162,7 @@ def _doors_at_ends(
     hall: bool,
     rng: np.random.Generator,
 ) -> list[Door]:
-    """Some doors of the first and the last room to the corridors that cross."""
+    """Some doors from the first and the last room of a row to the crossing corridors."""
     ends = [(block[0], row[0].low[0], row[0], rim[0]), (block[1], row[-1].high[0], row[-1], rim[1])]
     return [
         _random_door(0, (outer, inner), (room.low[1], room.high[1]), hall, rng)
@@ -163,7 +178,7 @@ def _random_door(
         width = 2 * _decimetres(rng.uniform(0.8, min(2.5, (wall[1] - wall[0]) / 2 - 0.5)))
     else:
         width = float(rng.choice([1.0, 1.0, 1.2, 1.6]))
-    # A middle on the grid of the routes, else the narrowest doors would be shut for them.
+    # The middle lies on the grid of the routes, because otherwise no route would fit through narrow doors.
     middle = 2 * CELL * round(rng.uniform(wall[0] + width / 2 + 0.2, wall[1] - width / 2 - 0.2) / (2 * CELL))
     leaves: tuple[Leaf, ...] = ("open", "closed", "none")
     leaf = "none" if hall else leaves[rng.choice(3, p=[0.55, 0.3, 0.15])]
@@ -171,7 +186,7 @@ def _random_door(
 
 
 def _outline(room: Room, doors: Sequence[Door]) -> list[tuple[float, ...]]:
-    """The four walls of a rectangle without its doors."""
+    """The four walls of a room as lines, with gaps for its doors."""
     lines = []
     for axis in (0, 1):
         begin, end = room.low[1 - axis], room.high[1 - axis]
@@ -184,12 +199,12 @@ def _outline(room: Room, doors: Sequence[Door]) -> list[tuple[float, ...]]:
 
 
 def _line(axis: int, face: float, begin: float, end: float) -> tuple[float, ...]:
-    """A line that one crosses along ``axis``."""
+    """A line (x, y, x, y) perpendicular to ``axis``, at the coordinate ``face`` on it."""
     return (face, begin, face, end) if axis == 0 else (begin, face, end, face)
 
 
 def _windows(room: Room, face: float, rng: np.random.Generator) -> list[tuple[float, ...]]:
-    """Panes of glass a hand's breadth before the outer wall."""
+    """Panes of glass one cell (a decimetre) inside the outer wall."""
     inside = face + np.sign((room.low[1] + room.high[1]) / 2 - face) * CELL
     middles = np.arange(room.low[0] + 1, room.high[0] - 0.6, 1.8)
     half = rng.uniform(0.4, 0.8)
@@ -206,7 +221,7 @@ def _draw_door(drawing: Drawing, door: Door, rng: np.random.Generator) -> None:
             _line(door.axis, rng.uniform(min(door.faces), max(door.faces)), low, high)
         )
     elif door.leaf == "open":
-        # At least at a right angle, else it would stand in the way, and at most until it meets a wall.
+        # The door is open by at least a right angle, so that it blocks no route, and at most up to a wall.
         side = int(rng.integers(2))
         hinge = (low, high)[side]
         aside = min(door.width * np.sin(rng.uniform(0, 1.2)), abs(door.wall[side] - hinge))
@@ -222,13 +237,13 @@ def _draw_corridors(
     rows: Sequence[tuple[float, float]],
     rng: np.random.Generator,
 ) -> None:
-    """The ends of the corridors, some of them windows, and what stands or juts out along their sides."""
+    """Draw the ends of the corridors, some of them windows, and the objects along their sides."""
     spans = (columns[0][0], columns[-1][1]), (rows[0][0], rows[-1][1])
     for along, blocks in ((1, columns), (0, rows)):
         for (_, low), (high, _) in pairwise(blocks):
             for end in spans[along]:
                 material = GLASS if rng.random() < 0.3 else PLASTER
-                # Wider than the corridor, as far as a block may stand back.
+                # The end is wider than the corridor, because _shrink_block may have widened the corridor.
                 drawing.lines[material].append(_line(along, end, low - 1, high + 1))
             for place in np.arange(spans[along][0] + 1, spans[along][1] - 3, 2.5):
                 _draw_at_side(drawing, along, place + rng.uniform(0, 2), low, high, rng)
@@ -237,7 +252,7 @@ def _draw_corridors(
 def _draw_at_side(
     drawing: Drawing, along: int, place: float, low: float, high: float, rng: np.random.Generator
 ) -> None:
-    """Nothing, a pillar, a cupboard, a bin or a radiator at one side of a corridor."""
+    """Draw nothing, a pillar, a cupboard, a bin or a radiator at one side of a corridor."""
     half_length, half_depth = [(0, 0), (0.2, 0.12), (0.6, 0.2), (0.15, 0.15), (0.5, 0.06)][rng.integers(5)]
     if not half_length or min(high - low, 2.2) - 2 * half_depth < 1.4:
         return

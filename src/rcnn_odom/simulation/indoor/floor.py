@@ -1,4 +1,4 @@
-"""The map of a building's floor: where a robot or a person has room."""
+"""The map of a building's floor: the clearance for a robot or a person."""
 
 from dataclasses import dataclass
 
@@ -10,32 +10,37 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.scene import Walls
 
 CELL = 0.1
-"""Metres between the points of the floor's map."""
+"""Metres between the points of the floor map."""
 ROOM_TO_DRIVE = 0.45
-"""Metres between the middle of a robot and the nearest wall, at least."""
+"""Metres; least distance from the middle of a robot to the nearest wall."""
 
 
 @dataclass(frozen=True)
 class Floor:
-    """Where there is room on the floor.
+    """The free space of a floor.
 
     Attributes:
-        clearance: (X, Y) metres to the nearest wall, at every corner of a grid of ``CELL`` that begins at
-            the origin; never more than the true distance.
-        reachable: (X, Y) where a robot can be, all of it from everywhere.
+        clearance: (X, Y) metres to the nearest wall, at the points of a grid with spacing ``CELL`` that
+            begins at the origin; never more than the true distance.
+        reachable: (X, Y) whether a robot can be there; all these points are connected.
     """
 
     clearance: FloatArray
     reachable: npt.NDArray[np.bool_]
 
     def room_at(self, points: FloatArray) -> FloatArray:
-        """Metres to the nearest wall from points (..., 2); 0 outside of the building."""
+        """Distances (...) in metres from points (..., 2) to the nearest wall; 0 outside of the building."""
         cells = np.moveaxis(points, -1, 0) / CELL
         return ndimage.map_coordinates(self.clearance, cells, order=1, mode="constant")
 
 
 def map_floor(walls: Walls, far_corner: tuple[float, float]) -> Floor:
-    """The clearance everywhere, and the largest connected part where a robot fits."""
+    """Compute the clearance, and the largest connected part of the floor where a robot fits.
+
+    Args:
+        walls: everything that stands on the floor.
+        far_corner: x and y in metres of the corner opposite to the origin.
+    """
     length = np.hypot(*(walls.ends[:, 2:] - walls.ends[:, :2]).T)
     pieces = 1 + (length / (CELL / 2)).astype(int)
     wall = np.repeat(np.arange(len(walls)), pieces + 1)
@@ -43,14 +48,14 @@ def map_floor(walls: Walls, far_corner: tuple[float, float]) -> Floor:
     along = (np.arange(len(wall)) - first[wall]) / pieces[wall]
     points = (walls.ends[wall, :2] + along[:, None] * (walls.ends[wall, 2:] - walls.ends[wall, :2])) / CELL
     free = np.ones(np.ceil(np.array(far_corner) / CELL).astype(int) + 16, dtype=bool)
-    # All four corners around a point: whichever way one looks, the map's wall is not behind the true one.
+    # Marks all four grid points around a point of a wall, so the map never overestimates the clearance.
     low, high = np.floor(points + 1e-6).astype(int), np.ceil(points - 1e-6).astype(int)
     for x in (low[:, 0], high[:, 0]):
         for y in (low[:, 1], high[:, 1]):
             free[x, y] = False
     clearance = CELL * ndimage.distance_transform_edt(free)
     parts, _ = ndimage.label(clearance >= ROOM_TO_DRIVE)
-    # The first part is the open country around the building: it holds the origin.
+    # The part that contains the origin is the open space around the building.
     sizes = np.bincount(parts.ravel())
     sizes[[0, parts[0, 0]]] = 0
     return Floor(clearance, parts == sizes.argmax())

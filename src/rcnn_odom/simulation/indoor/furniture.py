@@ -1,4 +1,4 @@
-"""The furniture of a building's rooms."""
+"""Places furniture in the rooms of a building."""
 
 import numpy as np
 
@@ -6,7 +6,7 @@ from rcnn_odom.simulation.drawing import Drawing, Room
 
 
 def furnish_room(drawing: Drawing, room: Room, hall: bool, rng: np.random.Generator) -> None:
-    """More of everything in larger rooms; a hall is emptier and has pillars."""
+    """Place random furniture in a room; larger rooms get more, halls get pillars and less furniture."""
     area = room.size[0] * room.size[1]
     if hall:
         half = rng.uniform(0.15, 0.35)
@@ -16,20 +16,20 @@ def furnish_room(drawing: Drawing, room: Room, hall: bool, rng: np.random.Genera
         area *= 0.4
     crowded = rng.uniform(0.5, 1.3)
     for _ in range(rng.poisson(crowded * (1 + area / 12))):
-        drawing.boxes.append(_at_wall(room, rng.uniform(0.3, 1.0), rng.uniform(0.15, 0.3), rng))
+        drawing.boxes.append(_place_at_wall(room, rng.uniform(0.3, 1.0), rng.uniform(0.15, 0.3), rng))
     for _ in range(rng.poisson(crowded * area / 60)):
-        drawing.boxes.append(_at_wall(room, rng.uniform(0.7, 1.1), 0.42, rng))
+        drawing.boxes.append(_place_at_wall(room, rng.uniform(0.7, 1.1), 0.42, rng))
     for _ in range(rng.poisson(crowded * (0.5 + area / 14))):
         _place_table(drawing, room, rng)
     for _ in range(rng.poisson(crowded * (0.5 + area / 20))):
-        x, y = _anywhere(room, 0.4, rng)
+        x, y = _random_position(room, 0.4, rng)
         drawing.boxes.append((x, y, rng.uniform(0.1, 0.3), rng.uniform(0.1, 0.3), rng.uniform(0, np.pi)))
 
 
-def _at_wall(
+def _place_at_wall(
     room: Room, half_length: float, half_depth: float, rng: np.random.Generator
 ) -> tuple[float, float, float, float, float]:
-    """Something with its back to one of the four walls."""
+    """A box at one of the four walls: x, y, half length, half depth and direction."""
     along = int(rng.integers(2))
     half_length = min(half_length, room.size[along] / 2 - 0.1)
     place = [0.0, 0.0]
@@ -39,22 +39,23 @@ def _at_wall(
     return place[0], place[1], half_length, half_depth, along * np.pi / 2
 
 
-def _anywhere(room: Room, gap: float, rng: np.random.Generator) -> tuple[float, float]:
+def _random_position(room: Room, gap: float, rng: np.random.Generator) -> tuple[float, float]:
+    """x and y of a position in a room, at least ``gap`` metres from its walls."""
     return rng.uniform(room.low[0] + gap, room.high[0] - gap), rng.uniform(
         room.low[1] + gap, room.high[1] - gap
     )
 
 
 def _place_table(drawing: Drawing, room: Room, rng: np.random.Generator) -> None:
-    """A table on four legs or on two side panels, at a wall or not, and chairs on four legs each."""
+    """Place a table with four legs or two side panels, at a wall or not, and up to two chairs."""
     half_length, half_depth = rng.uniform(0.5, 0.9), rng.uniform(0.3, 0.42)
     if rng.random() < 0.6:
-        x, y, _, _, direction = _at_wall(room, half_length, half_depth, rng)
+        x, y, _, _, direction = _place_at_wall(room, half_length, half_depth, rng)
     else:
-        x, y = _anywhere(room, 1.0, rng)
+        x, y = _random_position(room, 1.0, rng)
         direction = rng.choice([0, np.pi / 2]) + rng.normal(0, 0.1)
     if rng.random() < 0.5:
-        drawing.legs += _corners(x, y, half_length, half_depth, direction, 0.025)
+        drawing.legs += _legs_at_corners(x, y, half_length, half_depth, direction, 0.025)
     else:
         for side in (-half_length, half_length):
             x_side, y_side = x + side * np.cos(direction), y + side * np.sin(direction)
@@ -66,13 +67,13 @@ def _place_table(drawing: Drawing, room: Room, rng: np.random.Generator) -> None
             room.low[0] + 0.3 < x_chair < room.high[0] - 0.3
             and room.low[1] + 0.3 < y_chair < room.high[1] - 0.3
         ):
-            drawing.legs += _corners(x_chair, y_chair, 0.2, 0.2, turn, 0.015)
+            drawing.legs += _legs_at_corners(x_chair, y_chair, 0.2, 0.2, turn, 0.015)
 
 
-def _corners(
+def _legs_at_corners(
     x: float, y: float, half_length: float, half_width: float, direction: float, half_leg: float
 ) -> list[tuple[float, float, float, float, float]]:
-    """Legs at the corners of a table or chair."""
+    """The legs at the four corners of a table or chair, in the form of ``Drawing.legs``."""
     cos, sin = np.cos(direction), np.sin(direction)
     return [
         (x + u * cos - v * sin, y + u * sin + v * cos, half_leg, half_leg, direction)

@@ -1,1 +1,1 @@
-"""A city, its traffic, and a car that drives through."""
+"""A city, its traffic, and a car that drives through it."""

@@ -1,8 +1,8 @@
-"""The streets of a generated city, and routes through them.
+"""Generates the streets of a city, and routes through them.
 
-The streets are drawn on a straight grid, where blocks and their sides are easy to describe, and then bent by
-a smooth `Warp`: a little in a town, strongly in the country, where roads wind. A route is a drive through the
-plan, still to be bent and rounded (see ``line.py``).
+The streets are planned on a straight grid, where blocks and their sides are easy to describe. Then a smooth
+`Warp` bends them, slightly in a town and strongly in the country. A route is planned on the straight grid as
+well; ``line.py`` bends it and rounds its corners.
 """
 
 from collections.abc import Iterator
@@ -17,50 +17,50 @@ BLOCKS = 8
 """Blocks along each side of the city."""
 
 LANE_OFFSET = 1.2
-"""Metres from the middle of a street to the line one drives on: cars keep to the right."""
+"""Metres from the middle of a street to the line on which cars drive, on the right side."""
 
 KERB = 3.2
-"""Metres from the front gardens to where nothing stands any more: pavement, and cars parked on the street."""
+"""Metres from the front gardens to the free part of the street, for the pavement and parked cars."""
 
 TIGHTEST_TURN_SIDE = 3.9
-"""Metres that a car needs between its line and the kerb on the inner side for a turn at a crossing; where a
-street has less, it swings out."""
+"""Metres that a car needs between its line and the inner kerb for a turn at a crossing; if a street has less
+room, the car swings out."""
 
 SWING_LENGTH = 25.0
-"""Metres before and after a crossing over which it does so."""
+"""Metres before and after a crossing over which the car swings out."""
 
 AGAIN = 0.5
-"""Chance of taking a street again for every time that it was driven, relative to a new one."""
+"""Factor of the probability of a street for each time that it has been driven already."""
 
 KERB_POINTS = np.arange(0.0, 48.0, 6.0)[:, None]
-"""Metres from a corner to the points that stand for its kerbs."""
+"""Metres from a corner to the points that represent its kerbs."""
 
 BEND_VARIES = (0.4, 1.05)
-"""How much of its roads' usual bend a city has."""
+"""Range of a city's bend as a factor of the usual bend of its kind of roads."""
 
 Cell = npt.NDArray[np.int64]
 
 
 @dataclass(frozen=True)
 class Roads:
-    """A kind of roads: what they are like and how they are driven; pairs are ranges.
+    """A kind of roads: their geometry and how they are driven; pairs of numbers are ranges.
 
-    The numbers were learnt from KITTI's sequences 00 02 03 04 06 08 09: from their curvature, the distance
-    between their turns and their speeds.
+    The numbers are fitted to KITTI's sequences 00 02 03 04 06 08 09: to their curvature, the distance between
+    turns, and their speeds.
 
     Attributes:
         block: metres, length of a block's side.
         half_width: metres from the middle of a street to the front gardens.
-        wave: metres, length of the waves that bend them.
-        bend: slope of the waves, summed, along one axis of the plan and along the other.
-        turn: chance of turning at a crossing.
-        right_radius: metres, radius wanted at the tightest point of a right turn.
-        left_radius: the same of a left turn, which is wider as it begins on the far side.
-        speed: metres per second that a driver has in mind on a free road.
-        gives_way: chance of slowing down at a crossing that is passed straight on.
-        stops: chance of a full stop at any crossing.
-        straying: metres that a driver strays from the lane's middle.
-        roughness: of the road, 1 what is usual in a town.
+        wave: metres, wavelengths of the waves that bend the roads.
+        bend: sum of the slopes of these waves, along the one and the other axis of the plan.
+        turn: probability of turning at a crossing.
+        right_radius: metres, wanted radius at the tightest point of a right turn.
+        left_radius: metres, the same for a left turn, which is wider because it crosses the street.
+        speed: metres per second, wanted speed on a free road.
+        gives_way: probability of slowing down at a crossing that is passed straight on.
+        stops: probability of a full stop at any crossing.
+        straying: metres, amplitude of the deviation from the middle of the lane.
+        roughness: roughness of the road; 1 is usual in a town.
     """
 
     block: tuple[float, float]
@@ -91,7 +91,7 @@ RESIDENTIAL = Roads(
     straying=(0.1, 0.3),
     roughness=(0.8, 1.2),
 )
-"""As in 00 and 08: a turn every 150 metres, hardly a moment without slowing down or speeding up."""
+"""As in 00 and 08: a turn every 150 metres, and nearly always accelerating or braking."""
 
 COUNTRY = Roads(
     block=(90, 220),
@@ -107,7 +107,7 @@ COUNTRY = Roads(
     straying=(0.05, 0.15),
     roughness=(0.7, 1.1),
 )
-"""As in 02, 03 and 09: roads that wind."""
+"""As in 02, 03 and 09: winding roads."""
 
 MAIN = Roads(
     block=(120, 260),
@@ -123,20 +123,20 @@ MAIN = Roads(
     straying=(0.05, 0.2),
     roughness=(0.3, 0.9),
 )
-"""As in 04 and 06: straight on, fast, few turns."""
+"""As in 04 and 06: straight and fast roads with few turns."""
 
 SHARES = {RESIDENTIAL: 0.5, COUNTRY: 0.4, MAIN: 0.1}
-"""How often each kind is met: by their share of the frames of those seven sequences."""
+"""Probability of each kind: its share of the frames of those seven sequences."""
 
 
 @dataclass(frozen=True)
 class Warp:
-    """A sum of long waves that bends the plane.
+    """A smooth deformation of the plane by a sum of long waves.
 
     Attributes:
         waves: (K, 2) wave vectors in radians per metre.
         phases: (K,) radians.
-        pushes: (K, 2) metres by which each wave moves a point at its crest.
+        pushes: (K, 2) metres, displacement of a point at the crest of each wave.
     """
 
     waves: FloatArray
@@ -144,18 +144,18 @@ class Warp:
     pushes: FloatArray
 
     def __call__(self, points: FloatArray) -> FloatArray:
-        """Where points (..., 2) of the straight plan lie in the city, metres."""
+        """Map points (..., 2) of the straight plan to points (..., 2) in the city, both in metres."""
         return points + np.sin(points @ self.waves.T + self.phases) @ self.pushes
 
 
 @dataclass(frozen=True)
 class Plan:
-    """Where the streets of the straight city run; along its rim there is no street.
+    """The straight plan of the streets of a city; there is no street along its rim.
 
     Attributes:
         centres: (2, BLOCKS + 1) metres: x of the streets that run along y, and y of those along x.
         half_widths: (2, BLOCKS + 1) metres from the middle of a street to the front gardens.
-        roads: what kind of streets these are.
+        roads: kind of the streets.
     """
 
     centres: FloatArray
@@ -163,23 +163,23 @@ class Plan:
     roads: Roads = RESIDENTIAL
 
     def blocks(self) -> Iterator[tuple[FloatArray, FloatArray]]:
-        """Lower left and upper right corner, both (2,), of every block."""
+        """Yield the lower left and the upper right corner, both (2,), of each block."""
         low, high = self.centres + self.half_widths, self.centres - self.half_widths
         for i in range(BLOCKS):
             for j in range(BLOCKS):
                 yield np.array([low[0, i], low[1, j]]), np.array([high[0, i + 1], high[1, j + 1]])
 
     def crossing(self, cell: Cell) -> FloatArray:
-        """Middle (2,) of the crossing of two streets, by their indices (2,)."""
+        """Middle (2,) of a crossing in metres; ``cell`` (2,) are the indices of its streets."""
         return self.centres[[0, 1], cell]
 
     def room(self, cell: Cell) -> FloatArray:
-        """Metres (2,) in x and in y from the middle of a crossing to where cars may be parked."""
+        """Metres (2,) in x and in y from the middle of a crossing to the parked cars."""
         return self.half_widths[[0, 1], cell] - KERB
 
 
 def random_plan(rng: np.random.Generator) -> Plan:
-    """The streets of a town, of the country, or along main roads."""
+    """A random plan with a random kind of roads."""
     roads = list(SHARES)[rng.choice(len(SHARES), p=list(SHARES.values()))]
     half_widths = rng.uniform(*roads.half_width, (2, BLOCKS + 1))
     pitch = rng.uniform(*roads.block, (2, BLOCKS)) + half_widths[:, 1:] + half_widths[:, :-1]
@@ -188,9 +188,15 @@ def random_plan(rng: np.random.Generator) -> Plan:
 
 
 def random_warp(plan: Plan, rng: np.random.Generator, count: int = 3) -> Warp:
-    """Waves that bend the plan's streets as much as its kind of roads is bent.
+    """Random waves that bend the streets of a plan as its kind of roads requires.
 
-    Waves push across themselves, nearly along the plan's axes: they bend streets, but hardly squeeze them.
+    The waves are transversal and run nearly along the axes of the plan, so they bend streets but hardly
+    compress them.
+
+    Args:
+        plan: the plan.
+        rng: source of all random choices.
+        count: number of waves along each axis.
     """
     axis = np.arange(2).repeat(count)
     if rng.random() < 0.5:
@@ -209,13 +215,13 @@ def random_warp(plan: Plan, rng: np.random.Generator, count: int = 3) -> Warp:
 
 @dataclass(frozen=True)
 class Route:
-    """A drive through the straight plan: W way points, C of which are crossings.
+    """A route through the straight plan: W way points, C of which are crossings.
 
     Attributes:
         points: (W, 2) metres.
-        crossings: (C,) which way points are crossings.
+        crossings: (C,) indices of the way points that are crossings.
         turn: (C,) 1 for a left turn there, -1 for a right turn, 0 for straight on.
-        inner: (C, K, 2) points along the inner kerbs of a turn, before and after the corner it goes round.
+        inner: (C, K, 2) metres, points on the inner kerbs of a turn, before and after its corner.
     """
 
     points: FloatArray
@@ -225,10 +231,10 @@ class Route:
 
 
 def random_route(plan: Plan, length: float, rng: np.random.Generator) -> Route:
-    """A random walk over the crossings on the right of the road, more than ``length`` metres long.
+    """A random walk over the crossings on the right side of the road, longer than ``length`` metres.
 
-    Streets that were not driven before are preferred, but some are driven again, either way. A longer route
-    begins like a shorter one.
+    New streets are preferred, but some are driven again, in either direction. With the same ``rng``, a longer
+    route begins like a shorter one.
     """
     cell = rng.integers(2, BLOCKS - 1, 2)
     way = np.array([[1, 0], [-1, 0], [0, 1], [0, -1]])[rng.integers(4)]
@@ -259,8 +265,8 @@ def random_route(plan: Plan, length: float, rng: np.random.Generator) -> Route:
 
 
 def _vertex(plan: Plan, cell: Cell, way: Cell, following: Cell, turn: int) -> FloatArray:
-    """Where the lines (2,) before and after a crossing meet."""
-    # A street's offset shifts the line in one axis only, so one pair holds those of both streets.
+    """The point (2,) in metres where the lines before and after a crossing meet."""
+    # The offset of a street shifts the line along one axis only, so one pair holds both offsets.
     offset = np.full(2, LANE_OFFSET)
     if turn < 0:
         offset = np.minimum(offset, plan.room(cell) - TIGHTEST_TURN_SIDE)
@@ -270,13 +276,14 @@ def _vertex(plan: Plan, cell: Cell, way: Cell, following: Cell, turn: int) -> Fl
 
 
 def _right_of(way: Cell) -> Cell:
+    """The direction to the right of a direction, both (2,)."""
     return np.array([way[1], -way[0]])
 
 
 def _next_way(
     cell: Cell, way: Cell, turn: float, visits: dict[tuple[int, ...], int], rng: np.random.Generator
 ) -> Cell:
-    """Straight on, right or left, on streets that have blocks on both sides."""
+    """Choose straight on, right or left at random, among streets that have blocks on both sides."""
     ways = [way, _right_of(way), -_right_of(way)]
     chances = np.array([1 - turn, turn / 2, turn / 2])
     for index, one in enumerate(ways):

@@ -1,8 +1,8 @@
-"""How a driver goes along a route: the line of the wheels, the speed on it, and the sway of the car.
+"""Simulates a car's drive along a route: the line of its wheels, its speed, and its sway.
 
-The constants and ranges here and in ``line.py``, ``speed.py`` and ``sway.py`` were learnt from the motion of
-KITTI's sequences 00 02 03 04 06 08 09, never from 05, 07 or 10;
-``python -m rcnn_odom.comparison.motion`` compares the two.
+The constants and ranges here and in ``line.py``, ``speed.py`` and ``sway.py`` are fitted to the motion of
+KITTI's sequences 00 02 03 04 06 08 09, never to 05, 07 or 10;
+``python -m rcnn_odom.comparison.motion`` compares simulated and real motion.
 """
 
 from dataclasses import dataclass, replace
@@ -17,21 +17,21 @@ from rcnn_odom.simulation.street.speed import FRAME_TIME, SPEED_VARIES, travel
 from rcnn_odom.simulation.street.sway import sway
 
 LEVER = (0.75, 1.0)
-"""Metres of the laser ahead of the rear axle; with the slip of the tyres and the way driven while turning,
-its step aside in turns comes to 0.78 to 0.95 metres a radian."""
+"""Metres from the rear axle forward to the laser. With the slip of the tyres and the distance driven during a
+turn, the lateral step of the laser in turns is 0.78 to 0.95 metres per radian."""
 
 SLIP = 0.008
-"""Radians by which tyres slip outwards for every m/s^2 of lateral acceleration."""
+"""Radians of slip angle per m/s^2 of lateral acceleration; the car's nose points into the bend."""
 
 MOUNTING = (-0.002, 0.005)
-"""Radians by which a laser looks past the way that its car goes."""
+"""Radians between the direction of the laser and the direction in which its car drives."""
 
 SWAY_HEIGHT = 1.2
-"""Metres of the laser above the axis about which a car pitches and rolls: it moves with them."""
+"""Metres from the axis about which a car pitches and rolls up to the laser, which is moved by both."""
 
 PACE = (0.4, 1.6)
 PACE_FRAMES = 100
-"""By what factor a drive at another pace is slower or faster, and after how many frames that changes."""
+"""Range of the speed factor of a drive at another pace, and number of frames after which it changes."""
 
 
 @dataclass(frozen=True)
@@ -41,9 +41,9 @@ class Drive:
     Attributes:
         planar: (N, 3) x and y in metres and heading in radians of the laser in the world.
         tilt: (N, 2) pitch (positive: nose down) and roll (positive: left side up) in radians of the car on
-            its springs, relative to the road it stands on.
-        path: (M, 2) metres, the line that the middle of the rear axle drives, points `PATH_STEP` apart; it
-            begins before the drive and goes on after it.
+            its springs, relative to the road.
+        path: (M, 2) metres, the line that the middle of the rear axle drives, with points `PATH_STEP` apart;
+            it begins before the drive and ends after it.
         along: (N,) metres along the path.
     """
 
@@ -54,23 +54,23 @@ class Drive:
 
 
 def random_drive(plan: Plan, warp: Warp, frames: int, rng: np.random.Generator) -> Drive:
-    """Another drive for every draw from ``rng``; a longer one begins like a shorter one.
+    """Simulate a random drive; with the same ``rng``, a longer drive begins like a shorter one.
 
     Args:
-        plan: the streets, whose kind says how they are driven.
-        warp: from the plan to the world.
+        plan: the streets; their kind sets how they are driven.
+        warp: deformation from the plan to the world.
         frames: number of scans, `FRAME_TIME` apart.
-        rng: where all choices come from.
+        rng: source of all random choices.
     """
     route_rng, line_rng, speed_rng, body_rng = rng.spawn(4)
     roads = plan.roads
     fastest = roads.speed[1] * (1 + SPEED_VARIES)
     length = 2 * LEAD_IN + FRAME_TIME * (frames + 50) * fastest
-    # More than asked for: rounding the corners and averaging shorten it.
+    # The route is longer than needed, because rounding its corners and averaging shorten it.
     route = random_route(plan, 1.2 * length + 200, route_rng)
     path, crossings = driven_line(route, warp, roads, line_rng)
     heading = headings(path)
-    # Two frames more at both ends, where differences of differences are one-sided.
+    # Two more frames at both ends, where second differences are one-sided.
     along = travel(heading, crossings, route.turn, roads, frames + 4, speed_rng)
     planar, tilt = _laser(path, heading, along, roads, body_rng)
     path = path[: int((along[-1] + LEAD_IN) / PATH_STEP) + 1]
@@ -80,7 +80,18 @@ def random_drive(plan: Plan, warp: Warp, frames: int, rng: np.random.Generator) 
 def _laser(
     path: FloatArray, heading: FloatArray, along: FloatArray, roads: Roads, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """The laser's x, y and heading (N, 3), and pitch and roll (N, 2), on a car that is ``along`` a path."""
+    """Compute the motion of the laser on a car.
+
+    Args:
+        path: (M, 2) metres, line of the rear axle.
+        heading: (M,) radians, directions of the path.
+        along: (N,) metres, position of the rear axle on the path in each frame.
+        roads: kind of the roads.
+        rng: source of all random choices.
+
+    Returns:
+        x, y and heading (N, 3) of the laser in metres and radians; and pitch and roll (N, 2) in radians.
+    """
     lever, mounting = rng.uniform(*LEVER), rng.uniform(*MOUNTING)
     at = PATH_STEP * np.arange(len(path), dtype=np.float64)
     axle = resample(path, at, along)
@@ -97,11 +108,10 @@ def _laser(
 
 
 def at_other_paces(plan: Plan, warp: Warp, frames: int, rng: np.random.Generator) -> Drive:
-    """A drive whose speed says little about its roads: it is half or one and a half times the usual.
+    """Simulate a drive like `random_drive`, but with a speed that is 0.4 to 1.6 times the usual one.
 
-    Everything happens as in a drive of `random_drive`, but faster or slower, and the pace changes
-    every ten seconds. A network that learns from drives at KITTI's speeds alone guesses the speed
-    from what a street looks like, and measures little.
+    The factor changes every ten seconds. It prevents a network from guessing the speed from the look of a
+    street, which works with KITTI's speeds alone, instead of measuring it. Arguments as for `random_drive`.
     """
     drive_rng, pace_rng = rng.spawn(2)
     paces = pace_rng.uniform(*PACE, frames // PACE_FRAMES + 2)

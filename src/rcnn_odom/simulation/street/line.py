@@ -1,4 +1,4 @@
-"""The line that a car's wheels drive: the route bent with its streets, corners rounded, lanes strayed in."""
+"""The line that a car drives: the route bent with its streets, with round corners and some deviations."""
 
 from functools import partial
 
@@ -13,28 +13,39 @@ from rcnn_odom.simulation.street.smooth import average_twice, meander, random_wa
 Indices = npt.NDArray[np.int64]
 
 PATH_STEP = 0.25
+"""Metres between the points of the line."""
 LEAD_IN = 60.0
-"""Metres of the driven line before the drive and after it, for the traffic ahead and behind."""
+"""Metres of the line before and after the drive, for the traffic behind and ahead."""
 
 CLEARANCE = 2.75
-"""Metres between the line planned round a corner and whatever may stand there; some go to straying."""
+"""Metres; least distance from the planned line of a turn to the inner kerb, including room for deviations."""
 
 STEERING_LENGTH = 6.0
-"""Metres over which the steering wheel is turned: the line is averaged over them twice."""
+"""Metres of the window over which the line is averaged twice, because steering takes time."""
 
 STRAYING_WAVES = (22.0, 80.0)
-"""Metres after which a driver corrects the way in the lane."""
+"""Metres, wavelengths of the deviations from the middle of the lane."""
 
 
 def driven_line(
     route: Route, warp: Warp, roads: Roads, rng: np.random.Generator
 ) -> tuple[FloatArray, FloatArray]:
-    """The route in the world: points (M, 2) every `PATH_STEP`, and the crossings (C,) in metres along it."""
+    """Turn a route into the line that is driven in the world.
+
+    Args:
+        route: route through the plan.
+        warp: deformation from the plan to the world.
+        roads: kind of the roads.
+        rng: source of all random choices.
+
+    Returns:
+        Points (M, 2) of the line in metres, `PATH_STEP` apart; and the crossings (C,) in metres along it.
+    """
     driven = arc_length(route.points)
     fine = np.union1d(np.arange(0, driven[-1], 2 * PATH_STEP), driven[route.crossings])
     bent = warp(resample(route.points, driven, fine))
     at = np.searchsorted(fine, driven[route.crossings])
-    # Drawn before what depends on the number of crossings, so that a longer drive begins like a shorter one.
+    # Drawn before the values for each crossing, so that a longer drive begins like a shorter one.
     straying, waves = rng.uniform(*roads.straying), random_waves(STRAYING_WAVES, rng)
     rounded, at = _round_corners(bent, at, route, warp(route.inner), roads, rng)
     travelled = arc_length(rounded)
@@ -56,7 +67,19 @@ def driven_line(
 def _round_corners(
     line: FloatArray, at: Indices, route: Route, inner: FloatArray, roads: Roads, rng: np.random.Generator
 ) -> tuple[FloatArray, Indices]:
-    """A line (M, 2) whose turns are curves, and where in it the crossings ``at`` (C,) are now."""
+    """Replace the sharp corners of a line by curves.
+
+    Args:
+        line: (L, 2) metres.
+        at: (C,) indices of the crossings in the line.
+        route: the route.
+        inner: (C, K, 2) metres, points on the inner kerbs.
+        roads: kind of the roads.
+        rng: source of all random choices.
+
+    Returns:
+        The line (M, 2), and the new indices (C,) of the crossings.
+    """
     travelled = arc_length(line)
     gaps = np.diff(travelled[at], prepend=0.0, append=travelled[-1])
     pieces, new_at, first, count = [], [], 0, 0
@@ -85,20 +108,20 @@ def _bend(
     kerbs: FloatArray,
     gaps: FloatArray,
 ) -> tuple[float, FloatArray]:
-    """How a turn at ``middle`` (metres along a line) is driven: as wide as wanted, or as there is room.
+    """Plan the curve of a turn, with the wanted radius if there is room for it.
 
-    It is a quadratic Bezier curve: its curvature rises and falls, as a driver turns the wheel.
+    It is a quadratic Bezier curve, whose curvature rises and falls like the steering angle of a driver.
 
     Args:
-        line: (M, 2), with a sharp corner in the middle of the turn.
+        line: (M, 2) metres, with a sharp corner in the middle of the turn.
         travelled: (M,) metres along the line.
-        middle: metres along the line.
-        radius: metres, wanted at the tightest point.
-        kerbs: (K, 2) points on the inner side that it keeps away from.
+        middle: metres along the line to the middle of the turn.
+        radius: metres, wanted radius at the tightest point.
+        kerbs: (K, 2) metres, points on the inner kerbs, from which the curve keeps `CLEARANCE`.
         gaps: (2,) metres to the crossings before and after.
 
     Returns:
-        Metres before and after ``middle`` that the curve (P, 2) replaces, and the curve.
+        Metres before and after ``middle`` that the curve replaces, and the curve (P, 2).
     """
     points = partial(resample, line, travelled)
     widest = 0.45 * float(gaps.min())
@@ -108,7 +131,7 @@ def _bend(
     wanted = min(radius * np.sin(half) / np.cos(half) ** 2, widest)
     legs = wanted * np.linspace(1, 0.1, 19)
     start, end = points(middle - legs), points(middle + legs)
-    control = _meeting(start, start - points(middle - legs - 1), end, points(middle + legs + 1) - end)
+    control = _cross_tangents(start, start - points(middle - legs - 1), end, points(middle + legs + 1) - end)
     t = np.linspace(0, 1, 33)[:, None]
     curves = (1 - t) ** 2 * start[:, None] + 2 * t * (1 - t) * control[:, None] + t**2 * end[:, None]
     distance = np.hypot(*(curves[:, :, None] - kerbs).transpose(3, 0, 1, 2)).min(axis=(1, 2))
@@ -117,8 +140,13 @@ def _bend(
     return float(legs[chosen]), curves[chosen]
 
 
-def _meeting(start: FloatArray, before: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
-    """Where the tangents (P, 2) at both ends of curves meet, (P, 2)."""
+def _cross_tangents(start: FloatArray, before: FloatArray, end: FloatArray, after: FloatArray) -> FloatArray:
+    """Points (P, 2) where the tangents at the ends of curves meet.
+
+    Args:
+        start, end: (P, 2) metres, ends of the curves.
+        before, after: (P, 2) directions of the tangents there.
+    """
     gap = end - start
     ahead = (gap[:, 0] * after[:, 1] - gap[:, 1] * after[:, 0]) / (
         before[:, 0] * after[:, 1] - before[:, 1] * after[:, 0]
@@ -127,5 +155,5 @@ def _meeting(start: FloatArray, before: FloatArray, end: FloatArray, after: Floa
 
 
 def headings(path: FloatArray) -> FloatArray:
-    """Unwrapped radians (M,) along a path (M, 2)."""
+    """Directions (M,) along a path (M, 2) in radians, not wrapped."""
     return np.unwrap(np.arctan2(*np.gradient(path, axis=0).T[::-1]))

@@ -1,4 +1,4 @@
-"""Lines through points in the plane, and directions in it."""
+"""Polylines and directions in the plane."""
 
 import numpy as np
 
@@ -6,17 +6,27 @@ from rcnn_odom.geometry import FloatArray
 
 
 def arc_length(points: FloatArray) -> FloatArray:
-    """Metres from the first of points (N, 2) to each along them, (N,)."""
+    """Distances (N,) along a line with points (N, 2), from its first point to each point.
+
+    >>> arc_length(np.array([[0.0, 0.0], [3.0, 4.0], [3.0, 5.0]])).tolist()
+    [0.0, 5.0, 6.0]
+    """
     return np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(points, axis=0).T))])
 
 
 def resample(points: FloatArray, travelled: FloatArray, at: FloatArray) -> FloatArray:
-    """Points (M, 2) on a line at other places.
+    """Interpolate points on a line; values other than coordinates can be interpolated in the same way.
 
     Args:
-        points: (N, 2) of the line.
-        travelled: (N,) how far along it they are, rising.
-        at: (M,) how far along it those wanted are; before and after the line its ends stand in.
+        points: (N, K) points of the line.
+        travelled: (N,) distances of these points along the line, increasing.
+        at: (M,) distances of the wanted points; beyond the ends of the line, its end points are used.
+
+    Returns:
+        Points (M, K).
+
+    >>> resample(np.array([[0.0, 0.0], [2.0, 4.0]]), np.array([0.0, 1.0]), np.array([0.5])).tolist()
+    [[1.0, 2.0]]
     """
     return np.stack([np.interp(at, travelled, values) for values in points.T], axis=1)
 

@@ -1,4 +1,4 @@
-"""How fast a driver goes along a line: bends, crossings, and what a car and its driver can do."""
+"""Speed of a car along a line: limited by bends, crossings, and the accelerations of car and driver."""
 
 import numpy as np
 
@@ -12,39 +12,40 @@ FRAME_TIME = 0.1
 
 ACCELERATION = (2.1, 3.1)
 BRAKING = (2.7, 4.2)
-"""m/s^2 that drivers are capable of, before `PEDAL_TIME` takes the edge off."""
+"""m/s^2, largest accelerations of drivers, before the smoothing over `PEDAL_TIME`."""
 
 EFFORT = (0.25, 1.0)
-"""Share of it that a driver makes use of, changing along the way."""
+"""Part of these accelerations that a driver uses; it changes along the way."""
 
 EFFORT_WAVES = (60.0, 300.0)
 SPEED_WAVES = (80.0, 500.0)
-"""Metres over which effort and the speed in mind rise and fall."""
+"""Metres, wavelengths of the changes of effort and of wanted speed."""
 
 LATERAL_ACCELERATION = (2.6, 4.0)
-"""m/s^2 that a driver bears in bends: the 99th percentile of each sequence with bends is 2.2 to 4.0."""
+"""m/s^2, limit in bends; the 99th percentile of each KITTI sequence with bends is 2.2 to 4.0."""
 
 YAW_RATE = (0.5, 0.7)
-"""Radians per second at most in a turn at a crossing."""
+"""Radians per second, limit in bends and turns."""
 
 PEDAL_TIME = 1.6
-"""Seconds over which the speed is averaged twice: no pedal is pressed at once."""
+"""Seconds of the window over which the speed is averaged twice, to limit the jerk."""
 
 SPEED_VARIES = 0.15
-"""Share by which the speed in mind rises and falls."""
+"""Relative amplitude of the changes of the wanted speed."""
 
 TURN_SPEED = (1.0, 7.0)
-"""Metres per second in the middle of a turn at a crossing, where its bend does not ask for less."""
+"""Metres per second, limit in the middle of a turn at a crossing."""
 
 GIVE_WAY_SPEED = (1.0, 7.0)
+"""Metres per second of a car that gives way, at its slowest point."""
 GIVE_WAY_BEFORE = 10.0
 """Metres before the middle of a crossing where a car that gives way is slowest."""
 
 STOP = (2.5, 6.5)
-"""Seconds of standing, of which braking and starting smoothly take some."""
+"""Seconds of a stop; smoothing turns a part of it into braking and starting."""
 
 CRAWL = 0.1
-"""Metres per second at a stop line: a speed of 0 would never leave it."""
+"""Metres per second at a stop line; at a speed of 0, the car would never leave it."""
 
 
 def travel(
@@ -55,19 +56,22 @@ def travel(
     frames: int,
     rng: np.random.Generator,
 ) -> FloatArray:
-    """Metres along the path in every frame, (frames,).
+    """Simulate the position of a car on a path over time.
 
     Args:
-        heading: (M,) radians at every step of the path.
+        heading: (M,) radians, directions of the path, `PATH_STEP` apart.
         crossings: (C,) metres along the path.
-        turn: (C,) 0 where a crossing is passed straight on.
-        roads: their kind.
-        frames: how many.
-        rng: of the driver.
+        turn: (C,) 0 if a crossing is passed straight on.
+        roads: kind of the roads.
+        frames: number of frames, `FRAME_TIME` apart.
+        rng: source of all random choices.
+
+    Returns:
+        Metres (frames,) along the path in each frame.
     """
     along = PATH_STEP * np.arange(len(heading), dtype=np.float64)
-    mood = 1 + SPEED_VARIES * meander(along, random_waves(SPEED_WAVES, rng))
-    limit = np.minimum(_bend_limit(heading, rng), rng.uniform(*roads.speed) * mood)
+    variation = 1 + SPEED_VARIES * meander(along, random_waves(SPEED_WAVES, rng))
+    limit = np.minimum(_bend_limit(heading, rng), rng.uniform(*roads.speed) * variation)
     effort = np.mean(EFFORT) + np.ptp(EFFORT) / 2 * meander(along, random_waves(EFFORT_WAVES, rng))
     speeding_up, braking = rng.uniform(*ACCELERATION) * effort, rng.uniform(*BRAKING) * effort
     wait = _slow_at_crossings(limit, crossings, turn, roads, rng)
@@ -83,7 +87,7 @@ def travel(
 
 
 def _bend_limit(heading: FloatArray, rng: np.random.Generator) -> FloatArray:
-    """Metres per second, (M,), that a driver likes in the bends of a path."""
+    """Speed limits (M,) in metres per second because of the bends of a path with directions (M,)."""
     curvature = np.abs(np.gradient(heading, PATH_STEP)) + 1e-6
     lateral, yaw_rate = rng.uniform(*LATERAL_ACCELERATION), rng.uniform(*YAW_RATE)
     limit: FloatArray = np.minimum(np.sqrt(lateral / curvature), yaw_rate / curvature)
@@ -93,7 +97,11 @@ def _bend_limit(heading: FloatArray, rng: np.random.Generator) -> FloatArray:
 def _slow_at_crossings(
     limit: FloatArray, crossings: FloatArray, turn: Indices, roads: Roads, rng: np.random.Generator
 ) -> FloatArray:
-    """Lower the limit (M,) where one gives way; seconds of standing at every step, (M,)."""
+    """Lower the speed limit (M,) in place at crossings with a turn, a stop or other traffic.
+
+    Returns:
+        Seconds (M,) for which the car stands at each step of the path.
+    """
     wait = np.zeros(len(limit))
     for at, straight, (yields, slowly, stops, duration) in zip(
         crossings, turn == 0, rng.random((len(crossings), 4)), strict=True
@@ -112,9 +120,10 @@ def _slow_at_crossings(
 
 
 def _fastest(limit: FloatArray, speeding_up: FloatArray, braking: FloatArray) -> FloatArray:
-    """The fastest speed (M,) below a limit with accelerations within two bounds, all (M,).
+    """The fastest speeds (M,) below a limit with bounded accelerations, all (M,).
 
-    In squared speed over the way an acceleration is a slope: the answer is the lower envelope.
+    As a function of distance, half of the squared speed has the acceleration as its slope. So the squared
+    speed is the lower envelope of the limit and of lines with the largest slopes.
     """
     rise, fall = 2 * PATH_STEP * np.cumsum(speeding_up), 2 * PATH_STEP * np.cumsum(braking)
     squared = np.minimum.accumulate(limit**2 - rise) + rise

@@ -1,8 +1,8 @@
-"""What stands along the streets of a city: houses, walls, hedges, trees, parked cars, signs.
+"""Generates the objects along the streets of a city: houses, walls, hedges, trees, parked cars, signs.
 
-Every side of a block is drawn on the straight plan, in metres along the street and inwards, and comes into
-the city through the plan's warp. What matters is what a level laser on a car's roof, about 1.9 m above the
-road, can meet: fronts and their gaps, what is behind a gap, and the tops of things that are about as high.
+Each side of a block is drawn on the straight plan, in metres along the street and inwards, and then bent into
+the city by the plan's warp. Only objects that a level laser on a car's roof can hit, about 1.9 m above the
+road, are drawn: house fronts and their gaps, what is seen through a gap, and objects of about that height.
 """
 
 from collections.abc import Callable
@@ -17,7 +17,7 @@ from rcnn_odom.simulation.street.city import COUNTRY, MAIN, RESIDENTIAL, Plan, R
 from rcnn_odom.simulation.terrain import Ground
 
 SIGHT = 90.0
-"""Metres from the driven line within which blocks are drawn: a little more than the laser sees."""
+"""Metres from the driven line within which blocks are drawn, slightly more than the laser's range."""
 
 WALL = Material(returned=0.996)
 STONE = Material(returned=0.99, roughness=0.03)
@@ -30,16 +30,29 @@ TRUNK = Material(returned=0.98, roughness=0.01)
 WIRE = Material(returned=0.15, roughness=0.01)
 
 BELOW_GROUND = -3.0
-"""Bottom of what stands on the ground: deep enough for any slope along its foot."""
+"""Metres, bottom of objects on the ground, deep enough for any slope of the ground."""
 
 PIECE = 6.0
-"""Metres, longest straight wall: longer ones would cut across the bends of a winding road."""
+"""Metres, longest straight wall; longer walls would cut across the bends of a winding road."""
 
 Corner = tuple[float, float]
+"""Metres along the street and inwards."""
 
 
 class Side:
-    """One side of a block in metres along the street and inwards (negative: into the street)."""
+    """One side of a block, on which objects are drawn.
+
+    Coordinates are metres along the street and inwards (negative: into the street), heights are metres above
+    the ground.
+
+    Args:
+        rng: source of all random choices.
+        length: metres, length of the side.
+        depth: metres, depth of the block.
+
+    Attributes:
+        rows: arrays (W, 8) of walls: both ends (4), bottom, top, returned, roughness.
+    """
 
     def __init__(self, rng: np.random.Generator, length: float, depth: float) -> None:
         self.rng, self.length, self.depth = rng, length, depth
@@ -48,18 +61,18 @@ class Side:
     def line(
         self, points: list[Corner], material: Material, top: float, bottom: float = BELOW_GROUND
     ) -> None:
-        """Upright rectangles from point to point, their edges in metres above the ground."""
+        """Draw a wall along a line through points."""
         surface = (bottom, top, material.returned, material.roughness)
         self.rows.append(np.array([(*start, *end, *surface) for start, end in pairwise(points)]))
 
     def box(
         self, start: Corner, end: Corner, material: Material, top: float, bottom: float = BELOW_GROUND
     ) -> None:
-        """Four walls between two opposite corners."""
+        """Draw the four walls of a rectangle, given by two opposite corners."""
         self.line(rectangle(start, end), material, top, bottom)
 
     def post(self, along: float, inward: float, radius: float, material: Material, top: float) -> None:
-        """A five-sided post."""
+        """Draw a five-sided post."""
         corners = radius * np.exp(1j * (0.4 * np.pi * np.arange(6) + self.rng.uniform(0, np.pi)))
         points = [(along + corner.real, inward + corner.imag) for corner in corners.tolist()]
         self.line(points, material, top)
@@ -67,13 +80,13 @@ class Side:
     def leaves(
         self, along: float, inward: float, radius: float, top: float, bottom: float = BELOW_GROUND
     ) -> None:
-        """A bush or a tree's crown: leafy pieces here and there, between which a beam goes through."""
+        """Draw a bush or the crown of a tree: scattered pieces of leaves with gaps for beams."""
         count = int(6 + 10 * radius)
         where = radius * np.sqrt(self.rng.random(count)) * np.exp(2j * np.pi * self.rng.random(count))
         self._pieces(along + where.real, inward + where.imag, (0.05, 0.3), top, bottom)
 
     def thicket(self, start: float, end: float, inward: float, top: float) -> None:
-        """The edge of a wood or an overgrown fence: beams enter it more or less deeply."""
+        """Draw the edge of a wood or an overgrown fence, which beams enter to different depths."""
         count = int((end - start) * self.rng.uniform(1.5, 3.0))
         deep = inward + self.rng.exponential(self.rng.uniform(0.2, 1.5), count)
         self._pieces(self.rng.uniform(start, end, count), deep, (0.3, 1.0), top, BELOW_GROUND)
@@ -81,7 +94,7 @@ class Side:
     def _pieces(
         self, along: FloatArray, inward: FloatArray, sizes: tuple[float, float], top: float, bottom: float
     ) -> None:
-        """Leafy pieces around points (P,), turned every way, each about as high as the whole."""
+        """Draw pieces of leaves at points (P,), in random directions, each about as high as the whole."""
         count = len(along)
         half = self.rng.uniform(*sizes, count) * np.exp(1j * np.pi * self.rng.random(count))
         reach = np.clip(self.rng.normal(0.95, 0.25, count), 0.3, 1.0)
@@ -92,15 +105,15 @@ class Side:
         self.rows.append(np.stack(rows, axis=1))
 
     def tree(self, along: float, inward: float) -> None:
-        """A trunk, and often a crown that reaches down to the laser's height."""
+        """Draw a trunk, and sometimes a crown that reaches down to the laser's height."""
         self.post(along, inward, self.rng.uniform(0.08, 0.3), TRUNK, top=6.0)
         if self.rng.random() < 0.35:
             self.leaves(along, inward, self.rng.uniform(0.8, 2.2), 6.0, bottom=self.rng.uniform(1.3, 2.4))
 
-    # --- what fills a side -----------------------------------------------------------------------
+    # --- kinds of sides --------------------------------------------------------------------------
 
     def town(self) -> None:
-        """Front beside front, with an entry here and there."""
+        """Draw adjacent house fronts, with a few gaps."""
         setback = self.rng.uniform(0, 4)
         along = self.rng.uniform(0, 4)
         while along < self.length - 6:
@@ -110,7 +123,7 @@ class Side:
         self.backyards(setback + 14)
 
     def suburb(self) -> None:
-        """Houses in gardens, with fences, hedges and garages between street and house."""
+        """Draw houses in gardens, with fences, hedges and garages."""
         setback = self.rng.uniform(3, 9)
         along = self.rng.uniform(0, 8)
         while along < self.length - 8:
@@ -128,7 +141,7 @@ class Side:
         self.backyards(10)
 
     def estate(self) -> None:
-        """Long rows of flats or halls far from the road, behind lawns, trees or a fence."""
+        """Draw long blocks of flats or halls far from the road, behind lawns, trees or a fence."""
         setback = min(self.rng.uniform(5, 16), self.depth / 3)
         along = self.rng.uniform(0, 20)
         while along < self.length - 15:
@@ -143,7 +156,7 @@ class Side:
         self.backyards(setback + 16)
 
     def wood(self) -> None:
-        """Trees and undergrowth, or a park behind a hedge."""
+        """Draw trees and bushes, or a park behind a hedge."""
         if self.rng.random() < 0.4:
             self.broken_line(1.0, HEDGE, self.rng.uniform(1.5, 2.5), (5, 40), (2, 12))
         if self.rng.random() < 0.7:
@@ -154,7 +167,7 @@ class Side:
         self.backyards(min(25, self.depth / 3))
 
     def field(self) -> None:
-        """Open land: hardly anything in range but a fence, a bush or a lonely tree."""
+        """Draw open land with few objects: fences, hedges, bushes or single trees."""
         if self.rng.random() < 0.4:
             self.broken_line(self.rng.uniform(0.5, 3), WIRE, self.rng.uniform(1.0, 1.6), (20, 80), (5, 30))
         if self.rng.random() < 0.5:
@@ -165,10 +178,10 @@ class Side:
         for _ in range(self.rng.poisson(self.length / 40)):
             self.tree(self.rng.uniform(0, self.length), self.rng.uniform(2, min(40, self.depth / 2)))
 
-    # --- their parts -----------------------------------------------------------------------------
+    # --- parts of a side -------------------------------------------------------------------------
 
     def house(self, start: float, end: float, front: float, depth: float) -> None:
-        """A house whose front is a row of walls, bays and windows, as high as the laser looks."""
+        """Draw a house whose front is a row of walls, recesses and windows at the laser's height."""
         top = self.rng.uniform(4, 15)
         back = min(front + depth, self.depth / 2)
         self.line([(start, front), (start, back), (end, back), (end, front)], WALL, top)
@@ -185,7 +198,7 @@ class Side:
             start = piece_end
 
     def front_garden(self, start: float, end: float, depth: float) -> None:
-        """What divides a garden from the street, with an opening for the drive, and a bush or two."""
+        """Draw a hedge, wall or fence between garden and street, with an opening, and a few bushes."""
         material, top = [
             (HEDGE, self.rng.uniform(1.2, 2.4)),
             (STONE, self.rng.uniform(0.5, 2.1)),
@@ -206,7 +219,15 @@ class Side:
         pieces: tuple[float, float],
         gaps: tuple[float, float],
     ) -> None:
-        """A hedge or fence with openings."""
+        """Draw a hedge or fence with openings.
+
+        Args:
+            inward: metres inwards.
+            material: its material.
+            top: metres, its height.
+            pieces: metres, range of the lengths of its pieces.
+            gaps: metres, range of the lengths of its openings.
+        """
         along = self.rng.uniform(0, gaps[1])
         while along < self.length:
             end = min(along + self.rng.uniform(*pieces), self.length)
@@ -214,7 +235,7 @@ class Side:
             along = end + self.rng.uniform(*gaps)
 
     def broken_thicket(self, inward: float) -> None:
-        """Overgrown land with openings."""
+        """Draw overgrown land with openings."""
         along = self.rng.uniform(0, 10)
         while along < self.length:
             end = min(along + self.rng.uniform(10, 60), self.length)
@@ -222,7 +243,7 @@ class Side:
             along = end + self.rng.exponential(5)
 
     def backyards(self, nearest: float) -> None:
-        """What is seen through the gaps between houses: sheds, bushes, hedges between gardens."""
+        """Draw what is seen through the gaps between houses: sheds, bushes and overgrown land."""
         farthest = self.depth / 2
         if nearest + 2 > farthest:
             return
@@ -235,14 +256,14 @@ class Side:
         self.broken_thicket(self.rng.uniform((nearest + farthest) / 2, farthest))
 
     def bushes(self, for_each_metre: float, nearest: float, farthest: float) -> None:
-        """Undergrowth, so many a metre of street."""
+        """Draw bushes, on average ``for_each_metre`` per metre of street."""
         for _ in range(self.rng.poisson(self.length * for_each_metre)):
             radius, top = self.rng.uniform(0.5, 2.0), self.rng.uniform(1.0, 4.0)
             inward = self.rng.uniform(min(nearest + radius, farthest), farthest)
             self.leaves(self.rng.uniform(0, self.length), inward, radius, top)
 
     def parked_cars(self) -> None:
-        """Cars along the kerb; none so near a corner that a turning vehicle would need the place."""
+        """Draw cars along the kerb, except near the corners, where vehicles need the room to turn."""
         occupied = self.rng.choice([0.0, 0.1, 0.3, 0.7])
         along = 8 + self.rng.uniform(0, 3)
         while along < self.length - 14:
@@ -252,13 +273,13 @@ class Side:
             along += length + self.rng.uniform(0.5, 1.8)
 
     def car(self, along: float, kerb: float, length: float, height: float) -> None:
-        """Body and cabin; from the height of a van on, one box."""
+        """Draw a car as a body and a cabin; a van or a higher vehicle is a single box."""
         paint = DARK_PAINT if self.rng.random() < 0.2 else PAINT
         for (a, b, c, d), top in car_outline(length, height):
             self.box((along + a, kerb - 0.95 + b), (along + c, kerb - 0.95 + d), paint, top)
 
     def posts(self) -> None:
-        """A row of street trees in some streets; lamp posts and signs in most."""
+        """Draw a row of trees along some streets, and of lamp posts along the others; some traffic signs."""
         trees = self.rng.random() < 0.35
         spacing = self.rng.uniform(8, 16) if trees else self.rng.uniform(20, 40)
         along = self.rng.uniform(4, 20)
@@ -274,13 +295,17 @@ class Side:
 
 
 def rectangle(start: Corner, end: Corner) -> list[Corner]:
-    """Its corners from one of two opposite ones round to the same again."""
+    """Corners of a rectangle with two given opposite corners; the first corner is repeated as the last.
+
+    >>> rectangle((0, 0), (2, 1))
+    [(0, 0), (2, 0), (2, 1), (0, 1), (0, 0)]
+    """
     (a, b), (c, d) = start, end
     return [(a, b), (c, b), (c, d), (a, d), (a, b)]
 
 
 def car_size(rng: np.random.Generator) -> tuple[float, float]:
-    """Length and height in metres of some car: mostly lower than the laser, now and then a van or lorry."""
+    """Random length and height of a car in metres: mostly lower than the laser, sometimes a van or lorry."""
     kind = rng.random()
     if kind < 0.72:
         return rng.uniform(3.7, 4.8), rng.uniform(1.4, 1.55)
@@ -292,7 +317,7 @@ def car_size(rng: np.random.Generator) -> tuple[float, float]:
 
 
 def car_outline(length: float, height: float) -> list[tuple[tuple[float, float, float, float], float]]:
-    """Boxes (rear, right, front, left) in metres from the middle of the rear bumper, and their tops."""
+    """Boxes of a car, as ((rear, right, front, left), top), in metres from the middle of the rear bumper."""
     if height > 1.9:
         return [((0.0, -1.0, length, 1.0), height)]
     cabin = (0.08 * length, -0.75, 0.68 * length, 0.75)
@@ -300,19 +325,30 @@ def car_outline(length: float, height: float) -> list[tuple[tuple[float, float, 
 
 
 Filling = Callable[[Side], None]
-
+"""Draws one kind of side."""
 LINED_WITH: dict[Roads, dict[Filling, float]] = {
     RESIDENTIAL: {Side.suburb: 0.45, Side.town: 0.3, Side.estate: 0.15, Side.wood: 0.1},
     COUNTRY: {Side.wood: 0.45, Side.suburb: 0.3, Side.field: 0.15, Side.estate: 0.1},
     MAIN: {Side.wood: 0.35, Side.estate: 0.3, Side.field: 0.15, Side.town: 0.2},
 }
-"""What stands along each kind of road, and how often."""
+"""Kinds of sides along each kind of roads, with their probabilities."""
 
 
 def build_streets(
     plan: Plan, warp: Warp, ground: Ground, driven: FloatArray, rng: np.random.Generator
 ) -> Walls:
-    """Everything that stands within sight of a driven line (M, 2), in world coordinates."""
+    """Generate all standing objects within `SIGHT` of a driven line.
+
+    Args:
+        plan: the plan of the streets.
+        warp: deformation from the plan to the world.
+        ground: the ground.
+        driven: (M, 2) metres, line that is driven.
+        rng: source of all random choices.
+
+    Returns:
+        The walls, in world coordinates.
+    """
     fillings, shares = zip(*LINED_WITH[plan.roads].items(), strict=True)
     line = cKDTree(driven[::20])
     ends, surfaces = [], []
@@ -327,7 +363,7 @@ def build_streets(
             fillings[rng.choice(len(fillings), p=shares)](side)
             side.parked_cars()
             side.posts()
-            rows = _in_pieces(np.concatenate(side.rows))
+            rows = _cut_walls(np.concatenate(side.rows))
             ends.append(corner + rows[:, :4].reshape(-1, 2, 2) @ np.stack([along / length, inward / depth]))
             surfaces.append(rows[:, 4:])
     bent = warp(np.concatenate(ends)).reshape(-1, 4)
@@ -339,8 +375,8 @@ def build_streets(
     return walls[(size > 1e-6) & (line.query(middle)[0] < SIGHT + size)]
 
 
-def _in_pieces(rows: FloatArray) -> FloatArray:
-    """Rows (W, 8) of walls in pieces of `PIECE` at most, which bend with a street and follow its slopes."""
+def _cut_walls(rows: FloatArray) -> FloatArray:
+    """Cut rows (W, 8) of walls into pieces of at most `PIECE`, so that they follow bends and slopes."""
     extent = rows[:, 2:4] - rows[:, :2]
     count = np.maximum(1, np.ceil(np.hypot(*extent.T) / PIECE)).astype(np.int64)
     whole = np.repeat(np.arange(len(rows)), count)
@@ -352,7 +388,7 @@ def _in_pieces(rows: FloatArray) -> FloatArray:
 
 
 def _sides(low: FloatArray, high: FloatArray) -> list[tuple[FloatArray, FloatArray, FloatArray]]:
-    """First corner, extent and way inwards, each (2,), of the sides of a block, counter-clockwise."""
+    """For each side of a block, counter-clockwise: first corner, extent and vector inwards, each (2,)."""
     corners = np.array([low, [high[0], low[1]], high, [low[0], high[1]], low])
     extents = np.diff(corners, axis=0)
     return [(corners[i], extents[i], extents[(i + 1) % 4]) for i in range(4)]

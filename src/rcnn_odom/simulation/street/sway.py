@@ -1,4 +1,4 @@
-"""How a car sways on its springs and tyres."""
+"""Sway of a car on its springs and tyres: pitch, roll and yaw."""
 
 from dataclasses import dataclass
 
@@ -8,25 +8,25 @@ from rcnn_odom.geometry import FloatArray
 from rcnn_odom.simulation.street.speed import FRAME_TIME
 
 BUMP_FRAMES = 50
-"""Frames after which a bump is forgotten."""
+"""Number of frames after which a bump has no more effect."""
 
 PITCH_OF_ACCELERATION = -0.0015
-"""Radians of pitch (nose down) for every m/s^2 of speeding up."""
+"""Radians of pitch (nose down) per m/s^2 of forward acceleration."""
 
 ROLL_OF_ACCELERATION = 0.0075
-"""Radians of roll (left side up) for every m/s^2 to the left: a body leans outwards."""
+"""Radians of roll (left side up) per m/s^2 of acceleration to the left; the body leans outwards."""
 
 
 @dataclass(frozen=True)
 class _Sway:
-    """Random tilt of one kind: noise of the road through a damped spring, and through slow leaning.
+    """Random rotation about one axis: road noise through a damped spring (bounce) and a slow filter (lean).
 
     Attributes:
-        bounce_deg: standard deviation of the bounce on a usual road at 10 m/s.
-        frequency: of the bounce in hertz.
-        damping: of the bounce, as a share of the critical one.
-        lean_deg: standard deviation of the slow part.
-        lean_time: seconds after which it is forgotten.
+        bounce_deg: degrees, standard deviation of the bounce on a usual road at 10 m/s.
+        frequency: hertz, frequency of the bounce.
+        damping: damping of the bounce, as a part of the critical damping.
+        lean_deg: degrees, standard deviation of the slow part.
+        lean_time: seconds, time constant of the slow part.
     """
 
     bounce_deg: float
@@ -42,25 +42,25 @@ YAW_SWAY = _Sway(bounce_deg=0.0, frequency=1.0, damping=0.5, lean_deg=0.12, lean
 
 
 def sway(speed: FloatArray, aside: FloatArray, rough: float, rng: np.random.Generator) -> FloatArray:
-    """Pitch, roll and yaw (N, 3) of the car on its springs and tyres, radians.
+    """Simulate pitch, roll and yaw (N, 3) in radians of a car on its springs and tyres.
 
     Args:
         speed: (N,) metres per second.
-        aside: (N,) m/s^2 to the left.
-        rough: of the road.
-        rng: of the road's bumps.
+        aside: (N,) m/s^2, acceleration to the left.
+        rough: roughness of the road; 1 is usual in a town.
+        rng: source of the road's bumps.
     """
-    # A bump does nothing to a car that stands.
+    # Bumps have no effect on a car that stands.
     bumps = np.sqrt(np.clip(speed, 0, None) / 10)
     bumps = np.concatenate([np.full(BUMP_FRAMES - 1, bumps[0]), bumps])
     noise = rough * bumps[:, None] * rng.standard_normal((len(bumps), 6))
-    pitch = PITCH_OF_ACCELERATION * np.gradient(speed, FRAME_TIME) + _swing(PITCH_SWAY, noise[:, :2])
-    roll = ROLL_OF_ACCELERATION * aside + _swing(ROLL_SWAY, noise[:, 2:4])
-    return np.stack([pitch, roll, _swing(YAW_SWAY, noise[:, 4:])], axis=1)
+    pitch = PITCH_OF_ACCELERATION * np.gradient(speed, FRAME_TIME) + _filter_noise(PITCH_SWAY, noise[:, :2])
+    roll = ROLL_OF_ACCELERATION * aside + _filter_noise(ROLL_SWAY, noise[:, 2:4])
+    return np.stack([pitch, roll, _filter_noise(YAW_SWAY, noise[:, 4:])], axis=1)
 
 
-def _swing(kind: _Sway, noise: FloatArray) -> FloatArray:
-    """Radians (N,) after noise (N + BUMP_FRAMES - 1, 2) of the road went through bounce and lean."""
+def _filter_noise(kind: _Sway, noise: FloatArray) -> FloatArray:
+    """Filter road noise (N + BUMP_FRAMES - 1, 2) by bounce and lean; returns rotations (N,) in radians."""
     time = FRAME_TIME * np.arange(BUMP_FRAMES)
     turned = 2 * np.pi * kind.frequency * time
     bounce = np.exp(-kind.damping * turned) * np.sin(turned)

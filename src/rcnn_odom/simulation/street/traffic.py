@@ -1,4 +1,4 @@
-"""What moves in the streets: cars in both directions, a car ahead or behind, people on the pavements."""
+"""Moving objects in the streets: cars in both directions, a car ahead or behind, people on the pavements."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -17,21 +17,30 @@ from rcnn_odom.simulation.street.street import BELOW_GROUND, PAINT, car_outline,
 from rcnn_odom.simulation.terrain import Ground
 
 SEEN = 85.0
-"""Metres from the laser within which movers are kept: a little more than it sees."""
+"""Metres from the laser within which moving objects are kept, slightly more than the laser's range."""
 WARP_SLACK = 50.0
+"""Metres, bound on the displacement of a point by the warp."""
 CARS, WALKERS = 40, 20
-"""Different ones in a city; many look the same."""
+"""Number of different shapes of cars and of people in a city."""
 CAR_SPACING = (60.0, 400.0)
-"""Metres between cars of one direction on a street; a street's own, between these."""
+"""Metres, range of the mean distance between cars of one direction on a street."""
 WALKER_SPACING = (40.0, 300.0)
+"""Metres, the same for people."""
 CAR_SPEED, WALKER_SPEED = (4.0, 14.0), (0.8, 1.8)
+"""Metres per second."""
 KEPT_CLEAR = 6.0
-"""Metres around the laser where nothing else drives: nobody drives through our own car."""
+"""Metres around the laser without other objects, so that nothing drives through its car."""
 
 
 @dataclass
 class _Movers:
-    """Somethings on their way: at which frames they are where, and what shape they have."""
+    """Moving objects, K in all frames together.
+
+    Attributes:
+        frame: (K,) frame in which an object is seen.
+        pose: (K, 3) its x and y in metres and heading in radians.
+        shape: (K,) index of its shape.
+    """
 
     frame: npt.NDArray[np.int64]
     pose: FloatArray
@@ -41,17 +50,25 @@ class _Movers:
 def build_traffic(
     plan: Plan, warp: Warp, ground: Ground, drive: Drive, rng: np.random.Generator
 ) -> tuple[Walls, npt.NDArray[np.int64]]:
-    """Where the walls of all that moves are in every frame of a drive.
+    """Generate the moving objects of a drive.
+
+    Args:
+        plan: the plan of the streets.
+        warp: deformation from the plan to the world.
+        ground: the ground.
+        drive: the drive of the laser's car, N frames.
+        rng: source of all random choices.
 
     Returns:
-        The walls of all frames, frame after frame, and where (N + 1,) each begins.
+        The walls of the objects in all frames, frame by frame; and (N + 1,) the index of the first wall of
+        each frame, and the number of all walls.
     """
     shapes = [_car(rng) for _ in range(CARS)] + [_walker(rng) for _ in range(WALKERS)]
     cars, walkers = np.arange(CARS), np.arange(CARS, CARS + WALKERS)
     movers = [
         *_street_users(plan, warp, drive, rng, CAR_SPACING, CAR_SPEED, cars, on_road=True),
         *_street_users(plan, warp, drive, rng, WALKER_SPACING, WALKER_SPEED, walkers, on_road=False),
-        *_same_lane(drive, rng, cars),
+        *_cars_in_same_lane(drive, rng, cars),
         _Movers(np.zeros(0, dtype=np.int64), np.zeros((0, 3)), np.zeros(0, dtype=np.int64)),
     ]
     frame = np.concatenate([m.frame for m in movers])
@@ -85,9 +102,9 @@ def _street_users(
     shapes: npt.NDArray[np.int64],
     on_road: bool,
 ) -> Iterator[_Movers]:
-    """Users of all streets in both directions, each at a steady speed from end to end and again.
+    """Cars or people on all streets in both directions, at constant speeds from end to end, again and again.
 
-    They heed neither crossings nor each other: seen from far, that shows in no scan.
+    They ignore crossings and each other, which cannot be seen in the scans.
     """
     frames = len(drive.planar)
     extent = plan.centres[:, -1]
@@ -101,18 +118,27 @@ def _street_users(
                 pace = rng.uniform(*speed, count)
                 along = (start + FRAME_TIME * np.arange(frames)[:, None] * pace) % length
                 along = along if direction > 0 else length - along
-                # On the right of the road: for those who go along +y that is +x, along +x it is -y.
+                # They are on the right side: at +x if they move along +y, at -y if they move along +x.
                 side = direction * (1 if axis == 0 else -1)
                 points = np.empty((frames, count, 2))
                 points[..., axis], points[..., 1 - axis] = centre + side * aside, along
-                yield _bent(points, axis, direction, rng.choice(shapes, count), warp, drive)
+                yield _warp_movers(points, axis, direction, rng.choice(shapes, count), warp, drive)
 
 
-def _bent(
+def _warp_movers(
     points: FloatArray, axis: int, direction: int, shape: npt.NDArray[np.int64], warp: Warp, drive: Drive
 ) -> _Movers:
-    """Those points (N, count, 2) of a straight street that may be in sight, bent into the city."""
-    # The warp moves points by some metres only, so that choosing them on the plan wastes little.
+    """Select the objects of a straight street that may be in sight, and bend their positions into the city.
+
+    Args:
+        points: (N, count, 2) metres, positions on the plan.
+        axis: 0 for a street along y, 1 for a street along x.
+        direction: 1 or -1, direction of motion along the street.
+        shape: (count,) indices of the shapes.
+        warp: deformation from the plan to the world.
+        drive: the drive of the laser's car.
+    """
+    # The warp moves points by a few metres only, so they can be selected on the plan.
     frame, one = np.nonzero(np.abs(points - drive.planar[:, None, :2]).max(2) < SEEN + WARP_SLACK)
     ahead = np.zeros(2)
     ahead[1 - axis] = direction
@@ -120,8 +146,10 @@ def _bent(
     return _Movers(frame, np.column_stack([here, np.arctan2(*(there - here).T[::-1])]), shape[one])
 
 
-def _same_lane(drive: Drive, rng: np.random.Generator, shapes: npt.NDArray[np.int64]) -> Iterator[_Movers]:
-    """A car ahead and one behind for a while, keeping about their distance."""
+def _cars_in_same_lane(
+    drive: Drive, rng: np.random.Generator, shapes: npt.NDArray[np.int64]
+) -> Iterator[_Movers]:
+    """Cars ahead and behind in the same lane, each for some time and at a nearly constant distance."""
     frames = len(drive.planar)
     time = np.arange(frames)
     for side in (1, -1):
@@ -130,18 +158,18 @@ def _same_lane(drive: Drive, rng: np.random.Generator, shapes: npt.NDArray[np.in
             stop = start + int(rng.uniform(50, 500))
             during = time[max(start, 0) : max(stop, 0)]
             gap = rng.uniform(20, 60) + rng.uniform(2, 8) * np.sin(during / rng.uniform(20, 80))
-            where = (drive.along[during] + side * gap) / PATH_STEP
-            there = (where > 0) & (where < len(drive.path) - 2)
+            position = (drive.along[during] + side * gap) / PATH_STEP
+            on_path = (position > 0) & (position < len(drive.path) - 2)
             numbers = np.arange(len(drive.path), dtype=np.float64)
-            middle = resample(drive.path, numbers, where[there])
-            step = np.diff(drive.path, axis=0)[where[there].astype(int)]
+            middle = resample(drive.path, numbers, position[on_path])
+            step = np.diff(drive.path, axis=0)[position[on_path].astype(int)]
             pose = np.column_stack([middle, np.arctan2(step[:, 1], step[:, 0])])
-            yield _Movers(during[there], pose, np.full(len(pose), rng.choice(shapes)))
+            yield _Movers(during[on_path], pose, np.full(len(pose), rng.choice(shapes)))
             start = stop + int(rng.exponential(200))
 
 
 def _car(rng: np.random.Generator) -> FloatArray:
-    """Rows (W, 6) of a car's walls about its middle: ends, bottom and top in metres."""
+    """Rows (W, 6) of a random car's walls about its middle: both ends, bottom and top in metres."""
     length, height = car_size(rng)
     return np.concatenate(
         [_box(a - length / 2, b, c - length / 2, d, top) for (a, b, c, d), top in car_outline(length, height)]
@@ -149,12 +177,13 @@ def _car(rng: np.random.Generator) -> FloatArray:
 
 
 def _walker(rng: np.random.Generator) -> FloatArray:
-    """Rows (4, 6) of somebody on foot, or on a bicycle."""
+    """Rows (4, 6) of the walls of a random person on foot or on a bicycle."""
     half = rng.choice([0.2, 0.2, 0.35])
     return _box(-half, -0.22, half, 0.22, rng.uniform(1.55, 1.95))
 
 
 def _box(a: float, b: float, c: float, d: float, top: float) -> FloatArray:
+    """Rows (4, 6) of the walls of a box with opposite corners (a, b) and (c, d)."""
     corners = np.array(rectangle((a, b), (c, d)))
     rest = np.tile([BELOW_GROUND, top], (4, 1))
     return np.concatenate([corners[:-1], corners[1:], rest], axis=1)

@@ -1,1 +1,1 @@
-"""Every method on every set of recordings, beside each other: ``python evaluate.py -m +sweeps=peers``."""
+"""Compares odometry methods on sets of recordings: ``python evaluate.py -m +sweeps=peers``."""

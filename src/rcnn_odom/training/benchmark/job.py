@@ -1,9 +1,8 @@
-"""One method on all sets, and the table of a sweep's methods so far."""
+"""The benchmark job: measures one method on all sets, and writes the table of the sweep's methods so far."""
 
 import json
 import logging
 import platform
-import re
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -22,6 +21,7 @@ from rcnn_odom.training.benchmark.methods import find_method
 from rcnn_odom.training.benchmark.sets import load_sets
 from rcnn_odom.training.benchmark.table import as_markdown, as_text
 from rcnn_odom.training.job import in_sweep
+from rcnn_odom.training.machine import read_processor_name
 from rcnn_odom.training.run_state import write_config, write_json
 from rcnn_odom.training.settings import plain
 from rcnn_odom.training.sweep import expected_folders
@@ -29,22 +29,22 @@ from rcnn_odom.training.sweep import expected_folders
 log = logging.getLogger(__name__)
 
 TABLE = "benchmark"
-"""Name of the table's files, ``.md`` and ``.json``."""
+"""Name of the files of the table, without ``.md`` and ``.json``."""
 PACKAGES = ("rcnn-odom", "numpy", "numba", "kiss-icp", "genz-icp", "small_gicp", "karto-scanmatcher")
 
 
 @dataclass(frozen=True, kw_only=True)
 class BenchmarkOptions:
-    """What the files of ``conf/benchmark`` have in common.
+    """The options that all files of ``conf/benchmark`` have.
 
     Attributes:
-        method: a model that does not train, a shipped network, a file of ``rcnn-odom export`` or a run.
-        options: of a model that does not train.
-        root: folder of the recordings; what is not there is left out.
-        lasers: for the sets to refer to.
-        sets: by their names; see :class:`rcnn_odom.training.benchmark.sets.SetOptions`.
-        only: names of the sets that are measured; None: all.
-        voxels: metres by the name of a model and the kind of place.
+        method: a model without training, a shipped network, a file of ``rcnn-odom export`` or a run.
+        options: options of a model without training.
+        root: folder of the recordings; sets whose recordings are missing are left out.
+        lasers: lasers to which the sets refer.
+        sets: the sets by name; see :class:`rcnn_odom.training.benchmark.sets.SetOptions`.
+        only: names of the sets to measure; None: all.
+        voxels: voxel sizes in metres by the name of a model and the kind of place.
     """
 
     method: str
@@ -57,22 +57,22 @@ class BenchmarkOptions:
 
 
 def run_benchmark(cfg: DictConfig) -> Report:
-    """Measures one method on all sets; in a sweep also writes the table of the methods so far.
+    """Measures one method on all sets, and writes the table of the sweep's methods so far.
 
     Args:
         cfg: the configuration of ``evaluate.py`` with ``benchmark``.
 
     Returns:
-        What the job's ``metrics.json`` holds: ``benchmark``, see
-        :func:`rcnn_odom.training.benchmark.measure.score_timed`, by set.
+        The content of the job's ``metrics.json``; ``benchmark`` has the scores by set, see
+        :func:`rcnn_odom.training.benchmark.measure.score_timed`.
 
     Raises:
-        InputError: see its message.
+        InputError: an option is invalid, or there are no recordings.
     """
     settings = plain(cfg)
     options, folder = settings["benchmark"], Path(settings["run_dir"])
     check_options(BenchmarkOptions, options, "benchmark.")
-    (folder / METRICS).unlink(missing_ok=True)  # of an earlier sweep, which is not compared with this one
+    (folder / METRICS).unlink(missing_ok=True)  # Belongs to an earlier sweep.
     report: Report = {
         "method": options["method"],
         "options": options["options"],
@@ -86,7 +86,7 @@ def run_benchmark(cfg: DictConfig) -> Report:
 
 
 def _measure(options: Settings) -> Report:
-    """Scores of the method by set."""
+    """Measures the method; returns its scores by set."""
     names = options["only"] or list(options["sets"])
     sets = load_sets({name: choose("set of benchmark.sets", name, options["sets"]) for name in names})
     make_tracker = find_method(options["method"], options["options"], options["voxels"])
@@ -104,7 +104,7 @@ def _measure(options: Settings) -> Report:
 
 
 def _write_table(folder: Path) -> None:
-    """Writes the table of the jobs up to this one; prints it after the last."""
+    """Writes the table of the jobs so far; logs it after the last job."""
     folders, is_last = [folder], True
     if HydraConfig.initialized() and in_sweep():
         folder = Path(HydraConfig.get().sweep.dir)
@@ -121,29 +121,22 @@ def _write_table(folder: Path) -> None:
 
 
 def _row_name(job: Report) -> str:
-    """A method, and the options that it was given beside its own."""
+    """The name of a row: the method and the options that were set."""
     return " ".join([job["method"], *(f"{name}={value}" for name, value in job["options"].items())])
 
 
 def _machine() -> dict[str, str]:
-    """What the times depend on."""
+    """Properties of the machine that affect the times."""
     return {
-        "processor": _processor(),
+        "processor": read_processor_name(),
         "threads": "1, bound to one core",
         "python": platform.python_version(),
         "packages": ", ".join(f"{package} {found}" for package in PACKAGES if (found := _version(package))),
     }
 
 
-def _processor() -> str:
-    """Its name as the system tells it."""
-    info = Path("/proc/cpuinfo")
-    found = re.search(r"model name\s*:\s*(.*)", info.read_text("utf-8")) if info.exists() else None
-    features = "AVX-512" if info.exists() and "avx512f" in info.read_text("utf-8") else ""
-    return " ".join(filter(None, [found[1] if found else platform.processor(), features]))
-
-
 def _version(package: str) -> str | None:
+    """The version of an installed package; None if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:

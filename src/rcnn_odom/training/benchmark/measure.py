@@ -1,4 +1,4 @@
-"""One method on one set: its steps with the time that each takes, and their scores."""
+"""Runs one method on one set, measures the time of each step, and scores the steps."""
 
 import os
 import time
@@ -19,19 +19,19 @@ from rcnn_odom.models.tracking import Tracking
 from rcnn_odom.training.benchmark.sets import LoadedSet
 
 WARM_UP = 20
-"""Scans before the clock starts: code is compiled, memory and caches find their places."""
+"""Untimed scans at the beginning, in which code is compiled and caches are filled."""
 FAILED = (0.5, np.deg2rad(5.0))
-"""Metres and radians from which on a step's error counts as a failure."""
+"""Error of a step, in metres and radians, above which it counts as a failure."""
 
 
 @dataclass(frozen=True, eq=False)
 class Timed:
-    """What a method made of a set.
+    """The results of a method on a set of N scans.
 
     Attributes:
-        steps: N - 1 of them.
-        milliseconds: (N-1,) that each took, from the scan to the step.
-        errors: (N-1,) which scans but the first the method could not take.
+        steps: the N - 1 estimated steps.
+        milliseconds: (N-1,) computing time of each step.
+        errors: (N-1,) whether the method failed with an error at a scan after the first.
     """
 
     steps: Steps
@@ -41,8 +41,8 @@ class Timed:
 
 @contextmanager
 def one_core() -> Iterator[None]:
-    """Binds this thread, and those that it starts, to one core; not all libraries can be told otherwise."""
-    if not hasattr(os, "sched_setaffinity"):  # only Linux has it
+    """Binds this thread and its child threads to one core; some libraries have no option for that."""
+    if not hasattr(os, "sched_setaffinity"):  # Only Linux has it.
         yield
         return
     before = os.sched_getaffinity(0)
@@ -54,7 +54,7 @@ def one_core() -> Iterator[None]:
 
 
 def run_timed(tracker: ScanTracker, loaded: LoadedSet) -> Timed:
-    """Steps of all scans of a set, the very code of ``rcnn-odom run``, each with its time."""
+    """Estimates and times the steps of all scans of a set, with the same code as ``rcnn-odom run``."""
     tracking = Tracking(tracker)
     for scan in loaded.scans[:WARM_UP]:
         tracking.step(scan)
@@ -71,15 +71,15 @@ def run_timed(tracker: ScanTracker, loaded: LoadedSet) -> Timed:
 
 
 def score_timed(timed: Timed, loaded: LoadedSet) -> Report:
-    """What the table holds of a method on a set.
+    """Scores a method on a set.
 
     Returns:
         ``scans``; ``drift`` (a ratio, None without a segment), ``rotation_deg_per_m`` and ``segments``;
-        ``median_ms`` and ``p99_ms``; ``failures``, steps that are off by more than ``FAILED`` or that the
-        method could not make, and ``errors``, the latter alone; ``path_ratio``, the length of the
-        estimated path over that of the true one; where the set has them ``stretch`` (see
+        ``median_ms`` and ``p99_ms``; ``failures``, the number of steps with an error above ``FAILED`` or with
+        an exception of the method; ``errors``, the number of exceptions; ``path_ratio``, the length of the
+        estimated path divided by that of the true path; ``stretch`` (see
         :func:`rcnn_odom.evaluation.scores.stretch_errors`) and ``relations`` (see
-        :func:`rcnn_odom.evaluation.relations.score_relations`).
+        :func:`rcnn_odom.evaluation.relations.score_relations`) if the set has them.
     """
     drive, options, values = loaded.drive, loaded.options, timed.steps.values
     drift = planar_drift(drive, timed.steps, options["lengths"])
@@ -107,7 +107,7 @@ def score_timed(timed: Timed, loaded: LoadedSet) -> Report:
 
 
 def _score_relations(poses: FloatArray, loaded: LoadedSet) -> Report:
-    """Against relations between scans of the whole recording, of which the drive may be a part."""
+    """Compares poses with relations between scans of the whole recording; the drive may be a part of it."""
     recording, frames = loaded.recording, loaded.drive.frames
     every = np.full((len(recording), 4, 4), np.nan)
     every[frames if frames is not None else slice(None)] = poses

@@ -1,4 +1,4 @@
-"""What can be measured: models that do not train, shipped or exported networks, and runs."""
+"""Methods of the benchmark: models without training, shipped or exported networks, and runs."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -15,46 +15,49 @@ from rcnn_odom.recordings.beams import BeamCheck
 from rcnn_odom.training.benchmark.sets import LoadedSet
 
 MakeTracker = Callable[[LoadedSet], ScanTracker | None]
-"""The method before its first scan of a set; None where it does not know the set's laser."""
+"""Creates the tracker of a method for a set; None if the method was not trained for the laser of the set."""
 
 
 def find_method(name: str, options: dict[str, Any], voxels: dict[str, dict[str, float]]) -> MakeTracker:
-    """A method by its name.
+    """Finds a method by its name.
 
     Args:
-        name: of a model that does not train or of a shipped network, a file of ``rcnn-odom export``, or a
-            run's folder.
-        options: of a model that does not train.
-        voxels: metres by a model's name and the kind of place, for models that need one.
+        name: name of a model without training or of a shipped network, a file of ``rcnn-odom export``, or the
+            folder of a run.
+        options: options of a model without training.
+        voxels: voxel sizes in metres by the name of a model and the kind of place.
+
+    Returns:
+        A function that creates the tracker for a set.
 
     Raises:
-        InputError: no such method.
+        InputError: there is no such method.
     """
     if name in shipped_models() or Path(name).is_file():
         return _network(OnnxStepper(find_file(name)))
     if Path(name).is_dir():
-        from rcnn_odom.training.checkpoint import load_module  # with Lightning
+        from rcnn_odom.training.checkpoint import load_module  # Imports Lightning.
 
         return _network(load_module(Path(name) / BEST).model.stepper())
     model = find_model(name)
     if model.trains:
         raise InputError(
-            f"benchmark.method={name}: a network is measured as trained; give its run, outputs/..., or "
+            f"benchmark.method={name}: this network needs training; give a run, outputs/..., or "
             f"one that ships with rcnn-odom ({', '.join(shipped_models())})"
         )
     return lambda loaded: _tracker(model, options, voxels.get(name, {}), loaded)
 
 
 def _network(stepper: Stepper) -> MakeTracker:
-    """A network on the sets of lasers that it was trained for."""
-    return lambda loaded: PairTracker(stepper) if _knows_laser(stepper.description, loaded) else None
+    """Trackers of a network, for the sets whose laser it was trained for."""
+    return lambda loaded: PairTracker(stepper) if _is_trained_for_laser(stepper.description, loaded) else None
 
 
-def _knows_laser(description: Description, loaded: LoadedSet) -> bool:
-    """Whether a set's laser is one that a network was trained for.
+def _is_trained_for_laser(description: Description, loaded: LoadedSet) -> bool:
+    """Whether a network was trained for the laser of a set.
 
-    Where scans are drawn, beams may be farther apart than the sensor's and cover a part of its field of view.
-    But what has learned from lasers that turn all round is not measured on those that do not.
+    A network that renders scans accepts beams that are farther apart than those of its sensor, or cover only
+    a part of its field of view. But a network for lasers with 360 degrees is only measured with such lasers.
     """
     sensor = description.sensor
     if description.warping is None:
@@ -66,10 +69,10 @@ def _knows_laser(description: Description, loaded: LoadedSet) -> bool:
 def _tracker(
     model: type[Model], options: dict[str, Any], voxels: dict[str, float], loaded: LoadedSet
 ) -> ScanTracker:
-    """A model that does not train, with the voxel of the set's kind of place.
+    """The tracker of a model without training, with the voxel size for the set's kind of place.
 
     Raises:
-        InputError: an option is missing, unknown or has no meaning.
+        InputError: an option is missing, unknown or invalid.
     """
     place = loaded.options["place"]
     chosen = ({"voxel": voxels[place]} if place in voxels else {}) | options

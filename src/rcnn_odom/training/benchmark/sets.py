@@ -1,4 +1,4 @@
-"""The sets of recordings that methods are measured on: what ``conf/benchmark`` says of each."""
+"""Loads the sets of recordings of the benchmark, which ``conf/benchmark`` defines."""
 
 import json
 import logging
@@ -24,14 +24,15 @@ class SetOptions:
     """One of ``benchmark.sets``.
 
     Attributes:
-        place: the kind of place, by which ``benchmark.voxels`` gives each peer its voxel.
-        recording: its name, or a part of it, as in ``data.test``.
-        reader: its format and the options of that, as in ``data.reader``.
+        place: kind of place, for the voxel sizes in ``benchmark.voxels``.
+        recording: name of a recording or of a part of it, as in ``data.test``.
+        reader: format of the recording and its options, as in ``data.reader``.
         sensor: the laser, as in ``data.sensor``.
-        lengths: of the drift's segments in metres.
-        frames: first and last frame, both included, of a stretch that is also scored by itself.
-        relations: file of relations between scans that people have verified.
-        deskew: as ``data.deskew``, for models that undistort scans.
+        lengths: lengths in metres of the segments of the drift.
+        frames: first and last frame (inclusive) of a stretch that is also scored separately; None: no
+            stretch.
+        relations: file with relations between scans that people have verified; None: no relations.
+        deskew: whether scans are undistorted, as ``data.deskew``.
     """
 
     place: str
@@ -48,13 +49,13 @@ class SetOptions:
 
 @dataclass(frozen=True, eq=False)
 class LoadedSet:
-    """A set with its scans in memory, so that reading and simulating them is not measured.
+    """A set with its scans in memory, so that the time for reading or simulating them is not measured.
 
     Attributes:
-        options: what ``conf/benchmark`` says of it, checked.
-        recording: all of it.
-        drive: the part of it whose truth is known.
-        scans: of the drive.
+        options: checked options of the set, from ``conf/benchmark``.
+        recording: the whole recording.
+        drive: the measured part of the recording, with ground truth.
+        scans: the scans of the drive.
     """
 
     options: Settings
@@ -64,20 +65,20 @@ class LoadedSet:
 
     @property
     def deskew(self) -> str:
-        """Whether scans are undistorted, ``on`` or ``off``."""
+        """Whether scans are undistorted: ``on`` or ``off``."""
         return "on" if wants_deskew(self.options["deskew"], self.drive.is_compensated) else "off"
 
     @property
     def sensor(self) -> Sensor:
-        """The laser."""
+        """The laser of the set."""
         return Sensor(**self.options["sensor"])
 
 
 def load_sets(sets: dict[str, Settings]) -> dict[str, LoadedSet]:
-    """The sets that are there by their names; of the others it is told why they are left out.
+    """Loads the sets whose recordings exist, by name; logs which ones are left out.
 
     Raises:
-        InputError: an option of a set is missing, unknown or has no meaning; none of the sets is there.
+        InputError: an option of a set is missing, unknown or invalid; or no set has its recordings.
     """
     loaded = {}
     for name, options in sets.items():
@@ -88,13 +89,13 @@ def load_sets(sets: dict[str, Settings]) -> dict[str, LoadedSet]:
             continue
         loaded[name] = _load(json.dumps(options))
     if not loaded:
-        raise InputError("benchmark.root: none of the sets is there; give the folder of the recordings")
+        raise InputError("benchmark.root: no set has its recordings; give the folder of the recordings")
     return loaded
 
 
 @cache
 def _load(options_in_json: str) -> LoadedSet:
-    """A set; kept, since the jobs of a sweep follow each other in one process."""
+    """Loads a set; cached, since the jobs of a sweep run one after the other in one process."""
     options = json.loads(options_in_json)
     recording = open_recording(options["reader"])(parse_part(options["recording"])[0])
     log.info("reading %s %s", options["reader"]["format"], options["recording"])

@@ -1,4 +1,4 @@
-"""The table of a benchmark: a row for each method, a column for each set."""
+"""Formats the table of a benchmark: a row for each method, a column for each set."""
 
 from collections.abc import Callable, Mapping
 from typing import Any
@@ -10,8 +10,8 @@ Rows = Mapping[str, Mapping[str, Report]]
 """Scores by the name of the method and that of the set."""
 Cells = list[list[str]]
 
-NONE = "-"
-"""Of a method that does not know the set's laser, or of a set without such a score."""
+NO_SCORE = "-"
+"""Shown if a method was not measured on a set, or if a set does not have this score."""
 
 
 def _times(scores: Report) -> str:
@@ -25,12 +25,12 @@ def _failures(scores: Report) -> str:
 
 def _path(scores: Report) -> str:
     ratio = scores["path_ratio"]
-    return NONE if ratio is None else f"{ratio:.3f}"
+    return NO_SCORE if ratio is None else f"{ratio:.3f}"
 
 
 def _stretch(scores: Report) -> str:
     if "stretch" not in scores:
-        return NONE
+        return NO_SCORE
     errors = scores["stretch"]
     distance, heading = errors["smoothed_distance_mae_m"], errors["heading_mae_deg"]
     return f"{distance:.4f} m, {heading:.4f} deg, {percent(errors['end_ratio'])} %"
@@ -39,7 +39,7 @@ def _stretch(scores: Report) -> str:
 def _relations(scores: Report) -> str:
     errors = scores.get("relations", {}).get("sequential", {})
     if not errors.get("count"):
-        return NONE
+        return NO_SCORE
     return f"{100 * errors['translation_mean_m']:.1f} cm, {errors['rotation_mean_deg']:.2f} deg"
 
 
@@ -51,19 +51,19 @@ PARTS: dict[str, Callable[[Report], str]] = {
     "stretch: mean abs distance (smoothed truth) and heading, end point": _stretch,
     "relations in sequence: mean translation and rotation": _relations,
 }
-"""What is shown of each method and set, one part of the table after the other."""
+"""The parts of the table: title, and function that formats the cell of a method and a set."""
 
 
 def table_parts(rows: Rows) -> dict[str, Cells]:
-    """The table in parts by their titles, each with a header as its first row, and without empty columns."""
+    """The parts of the table by title, each with a header as first row; empty columns are left out."""
     sets = list(dict.fromkeys(name for scores in rows.values() for name in scores))
     parts = {}
     for title, show in PARTS.items():
         columns = {
-            name: [show(scores[name]) if name in scores else NONE for scores in rows.values()]
+            name: [show(scores[name]) if name in scores else NO_SCORE for scores in rows.values()]
             for name in sets
         }
-        columns = {name: cells for name, cells in columns.items() if set(cells) != {NONE}}
+        columns = {name: cells for name, cells in columns.items() if set(cells) != {NO_SCORE}}
         if columns:
             body = [list(row) for row in zip(rows, *columns.values(), strict=True)]
             parts[title] = [["", *columns], *body]
@@ -71,20 +71,20 @@ def table_parts(rows: Rows) -> dict[str, Cells]:
 
 
 def as_text(rows: Rows) -> str:
-    """The table for a terminal."""
+    """Formats the table for a terminal."""
     return "\n\n".join(
         aligned([[title, *header[1:]], *body]) for title, (header, *body) in table_parts(rows).items()
     )
 
 
 def as_markdown(rows: Rows, about: Mapping[str, Any]) -> str:
-    """The table as a page of Markdown.
+    """Formats the table as a page of Markdown.
 
     Args:
-        rows: as above.
-        about: what it was measured with, by name.
+        rows: scores by method and set.
+        about: properties of the machine by name.
     """
-    lines = ["# Methods beside each other", ""]
+    lines = ["# Comparison of methods", ""]
     lines += [f"- {name}: {value}" for name, value in about.items()]
     for title, (header, *body) in table_parts(rows).items():
         lines += ["", f"## {title[0].upper()}{title[1:]}", ""]
