@@ -287,7 +287,7 @@ def test_every_third_scan_is_a_drive_of_its_own():
 def test_unknown_truth_of_every_third_scan():
     part = cut({"x": with_unknown(numbered(20), 0, 1, 2, 4, 19)}, "x[::3]")
     assert part.scans[:, 0].tolist() == [3, 6, 9, 12, 15, 18]
-    with pytest.raises(InputError, match="frame 9, between"):
+    with pytest.raises(InputError, match="frame 9 is unknown, between"):
         cut({"x": with_unknown(numbered(20), 9)}, "x[::3]")
     with pytest.raises(InputError, match="1 frames with known poses"):
         cut({"x": numbered(20)}, "x[::20]")
