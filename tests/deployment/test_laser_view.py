@@ -22,8 +22,7 @@ WARPING = Warping(None, 2, 0.1, 0.1, 0.0, 0.0)
 HALF, WHOLE = np.arange(-90.0, 90.0), np.arange(-180.0, 180.0)
 SICK = Beams(-90.0, 179.0, 1.0)
 WORDS = (
-    "was trained on lasers that turn all round, but the beams of this laser lie from -90 to 89 degrees, one "
-    "every 1"
+    "has a sensor that turns all round, but the beams of this laser lie from -90 to 89 degrees, one every 1"
 )
 
 

@@ -211,6 +211,17 @@ def test_a_network_tells_of_the_first_scans_that_have_too_little_to_match():
     np.testing.assert_allclose(steps_of(fused)[6:], truth[1:], atol=0.02)
 
 
+def test_after_scans_without_returns_the_matcher_goes_on_alone():
+    """The network's step begins at a pose that the network has predicted, and the matcher is elsewhere."""
+    scans, truth = room(20)
+    bearings = scans[10].bearings
+    scans[10] = replace(scans[10], ranges=np.full(len(bearings), np.inf))
+    source, last_motion = NetworkPrior(Told(truth)), Prior(np.zeros(3), np.eye(3))
+    source.begin(scans[0])
+    alone = [source.expect(scan, 1, 0.1, last_motion)[0] is last_motion for scan in scans[1:]]
+    assert [number for number, each in enumerate(alone, start=1) if each] == [10, 11]
+
+
 def test_held_is_the_last_motion_as_if_it_were_measured():
     held = Prior(np.array([0.1, 0.0, 0.0]), np.diag([0.01, 0.01, 0.01]))
     assert LastMotion().expect(None, 1, None, held) == (held, ())

@@ -90,7 +90,48 @@ def test_what_is_not_seen_goes_on_and_gets_less_sure():
     assert deviations[50] > 2 * deviations[0]
 
 
-@pytest.mark.parametrize("periods", [(1, 1, 1, 1, 1, 1), (1, 1, 3, 1, 1, 2)])
+@pytest.mark.parametrize("motion", [(1.0, 0.0, 0.0), (1.0, 0.1, 0.15), (-0.5, 0.0, -0.3)])
+def test_a_prediction_over_periods_is_as_many_predictions(motion):
+    at_once, one_by_one = MotionFilter(CHANGE, TYPICAL), MotionFilter(CHANGE, TYPICAL)
+    for each in (at_once, one_by_one):
+        each.correct(np.array(motion), np.diag([1e-3, 1e-3, 1e-5]))
+        each.correct(np.zeros(3), np.diag([1e-3, 1e-3, 1e-5]))
+    displacement, pose = at_once.displacement(7), np.zeros(3)
+    at_once.predict(7)
+    for _ in range(7):
+        pose = advance(pose, one_by_one.displacement())
+        one_by_one.predict()
+    assert np.allclose(displacement, pose)
+    assert np.allclose(at_once.pose_covariance, one_by_one.pose_covariance, rtol=1e-9)
+    # And so are the covariances with the motion, which decide what the next measurement corrects.
+    corrected = [each.correct(np.full(3, 0.1), np.diag([1e-3] * 3)) for each in (at_once, one_by_one)]
+    for first, second in zip(*corrected, strict=True):
+        assert np.allclose(first, second, rtol=1e-9)
+    assert np.allclose(at_once.motion, one_by_one.motion, rtol=1e-9)
+
+
+def test_a_long_prediction_of_a_turning_laser_has_the_covariance_of_drawn_errors():
+    """Ten periods of 9 degrees each, without a measurement; linear errors, so that few draws tell."""
+    rng = np.random.default_rng(0)
+    change, first, motion = np.array([3e-3, 1e-3, 4e-4]), np.array([5e-3, 1e-3, 1e-3]), (1.0, 0.0, 0.15)
+    one = MotionFilter(change, first / 2)
+    one.motion = np.array(motion)
+    one.predict(10)
+    ends = []
+    for _ in range(4000):
+        pose, drawn = np.zeros(3), motion + first * rng.standard_normal(3)
+        for _ in range(10):
+            drawn = drawn + change * rng.standard_normal(3)
+            pose = advance(pose, drawn)
+        ends.append(pose)
+    exact = np.zeros(3)
+    for _ in range(10):
+        exact = advance(exact, np.array(motion))
+    errors = np.array([relative_step(exact, end) for end in ends])
+    assert np.allclose(np.sqrt(np.mean(errors**2, 0)), np.sqrt(np.diag(one.pose_covariance)), rtol=0.05)
+
+
+@pytest.mark.parametrize("periods", [(1, 1, 1, 1, 1, 1), (1, 1, 3, 1, 1, 2), (1, 1, 10, 1, 8, 1)])
 def test_covariances_are_those_of_drawn_errors(periods):
     """Steps and poses beside a key of 3,000 drives that turn, over the deviations that the filter gave."""
     rng = np.random.default_rng(1)

@@ -258,6 +258,53 @@ def test_scans_are_compared_across_a_gap(perfect, key_distance):
     assert [tracked[seen.index(n)].kind for n in (20, 21, 22)] == [Kind.HELD, Kind.HELD, Kind.ESTIMATED]
 
 
+@pytest.mark.parametrize("blind", [(1, 2, 3, 4, 5, 7, 8), (1, 3, 5, 6, 9, 10), (12, 13, 15, 16, 18)])
+def test_scans_without_returns_change_no_speed(perfect, blind):
+    """At the start and several times in a row; the steps before the next seen scan go on as the last one."""
+    scans, _ = drive(30)
+    steps = np.tile([0.1, 0.0, 0.0], (29, 1))
+    scans = np.stack([room_scan((0.1 * n, 0.0, 0.0)) for n in range(30)])
+    network = perfect(scans, steps)
+    scans = scans.copy()
+    scans[list(blind)] = 0.0
+    got = np.array([each.step.array() for each in track(network, scans, 0.1 * np.arange(30))])
+    places = np.cumsum(got[:, 0])
+    seen = [n for n in range(30) if n not in blind]
+    assert np.allclose(places[seen], 0.1 * np.array(seen), atol=1e-3)
+    known = [n for n in range(3, 30) if n > seen[2]]  # when two scans were compared
+    assert np.allclose(got[known, 0], 0.1, atol=5e-3)
+
+
+def test_after_a_failure_and_scans_without_returns_the_last_motion_goes_on(perfect):
+    steps = np.tile([0.1, 0.0, 0.0], (29, 1))
+    scans = np.stack([room_scan((0.1 * n, 0.0, 0.0)) for n in range(30)])
+    stepper = perfect(scans, steps)
+    stepper.network.poses[10] = np.full(3, np.nan)
+    blind = scans.copy()
+    blind[11:14] = 0.0
+    tracked = track(stepper, blind, 0.1 * np.arange(30))
+    got = np.array([each.step.array() for each in tracked])
+    assert [each.kind for each in tracked[9:16]] == [
+        Kind.ESTIMATED, *[Kind.HELD] * 5, Kind.ESTIMATED
+    ]  # fmt: skip
+    assert np.allclose(got[1:, 0], 0.1, atol=5e-3)
+
+
+def test_a_step_that_corrects_predictions_is_marked(perfect):
+    """Such a step is of no use to others, who have predicted something else."""
+    scans, steps = drive(12)
+    network = perfect(scans, steps)
+    scans = scans.copy()
+    scans[[5, 6]] = 0.0
+    bearings = np.deg2rad(SENSOR.first_bin_deg + np.arange(float(SENSOR.bins)))
+    tracker, marked = PairTracker(network), []
+    for number, ranges in enumerate(scans):
+        scan = Scan(ranges.astype(float), bearings)
+        tracker.register(scan) if number else tracker.begin(scan)
+        marked.append(tracker.corrects_prediction)
+    assert [number for number, each in enumerate(marked) if each] == [7]
+
+
 def test_over_a_longer_gap_the_motion_goes_on(perfect):
     scans, steps = drive(30)
     seen = [*range(8), *range(19, 30)]

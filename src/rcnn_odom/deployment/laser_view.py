@@ -55,8 +55,7 @@ class LaserViewCheck:
         if fitting := find_shipped_network(beams):
             advice = f"{option} {fitting} was trained on lasers that see a part of the circle"
         return (
-            f"{network} was trained on lasers that turn all round, but the beams of this laser lie {beams}; "
-            f"{advice}"
+            f"{network} has a sensor that turns all round, but the beams of this laser lie {beams}; {advice}"
         )
 
 

@@ -66,6 +66,7 @@ class McapLog:
         self._maps = LocalMaps(odometer)
         self._path = EvenSample[tuple[int, ros.Planar]](PATH_POSES)
         self._last: tuple[int, ros.Planar] | None = None
+        self._is_equal = False  # whether the last two stamps are
         self._last_stamp: int | None = None  # in the recording, of the last pose; None if it has none
         self._frame, self._count = "", 0
 
@@ -130,7 +131,9 @@ class McapLog:
         if before is None or self._last_stamp is None:
             return math.nan
         seconds = 1e-9 * (nanoseconds - before)
-        return seconds if 0 < seconds <= CLOCK_JUMP else math.nan
+        # Until a coarse clock advances, its stamps are equal; the next step is not of all that time.
+        was_equal, self._is_equal = self._is_equal, seconds == 0
+        return seconds if 0 < seconds <= CLOCK_JUMP and not was_equal else math.nan
 
     def _write_scan(self, bag: "_Bag", nanoseconds: int, scan: Scan) -> None:
         scan = add_bearings(scan, self._odometer)

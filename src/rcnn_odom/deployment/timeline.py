@@ -10,7 +10,7 @@ import numpy as np
 
 from rcnn_odom.deployment.odometer import Pose
 from rcnn_odom.geometry import FloatArray
-from rcnn_odom.recordings.clock import Clock
+from rcnn_odom.recordings.clock import CLOCK_JUMP, LATE_IN_A_ROW
 
 MOMENTS = 2400
 """Maximum number of points of a curve, about two for each dot of a picture."""
@@ -34,22 +34,31 @@ def causes_in(degraded: str) -> list[str]:
 class RecordingTime:
     """Seconds since the first scan, in spite of late scans and of clocks that are set.
 
+    Unlike :class:`rcnn_odom.recordings.clock.Clock`, which estimates periods, it never gives a clock up: what
+    counts here is the time between two plausible stamps.
+
     Attributes:
-        seconds: duration of the recording so far. A late scan, or a jump that counts as a clock that was set
-            (:class:`rcnn_odom.recordings.clock.Clock`), adds nothing. None if no scan had a stamp yet.
+        seconds: duration of the recording so far. A late scan, or a jump that counts as a clock that was set,
+            adds nothing. None if no scan had a stamp yet.
     """
 
     def __init__(self) -> None:
         self.seconds: float | None = None
-        self._clock = Clock(math.nan)
+        self._latest, self._late = 0.0, 0
 
     def add(self, stamp: float | None) -> None:
         """Adds the stamp of one more scan in seconds; None if it has none."""
         if stamp is None or not math.isfinite(stamp):
             return
-        # repeats: a coarse clock repeats its stamps; the time between two different ones still counts.
-        tick = self._clock.read(stamp, repeats=True)
-        self.seconds = (self.seconds or 0.0) + (tick.seconds or 0.0)
+        passed = stamp - self._latest
+        if self.seconds is None or abs(passed) > CLOCK_JUMP:
+            self.seconds, self._latest = self.seconds or 0.0, stamp
+        elif passed > 0:
+            self.seconds, self._latest, self._late = self.seconds + passed, stamp, 0
+        else:
+            self._late += 1
+            if self._late == LATE_IN_A_ROW:  # the clock was set back by a few seconds
+                self._latest, self._late = stamp, 0
 
 
 class RecentMotion:

@@ -103,7 +103,8 @@ class NetworkPrior:
         if not self.has_seen:
             return last_motion, self.begin(scan)
         found = self._tracker.register(scan, periods, seconds)
-        if not found.is_estimated:
+        # A step after scans without returns begins at the pose that the network predicted, not the matcher.
+        if not found.is_estimated or self._tracker.corrects_prediction:
             self._step = None
             return last_motion, _without_prior(found.notes)
         self._step = _inflate(found.step)

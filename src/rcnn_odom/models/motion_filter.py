@@ -62,7 +62,7 @@ class MotionFilter:
     def begin(self) -> None:
         """Forgets pose and motion: the next scan is the first one."""
         self.motion: FloatArray = np.zeros(3)
-        # Covariance of pose and motion, both in the frame of the last scan.
+        # Covariance of pose and motion in the frame of the last scan.
         self._errors: FloatArray = np.zeros((6, 6))
         self._errors[3:, 3:] = np.diag(np.square(2 * self._typical))
 
@@ -86,7 +86,7 @@ class MotionFilter:
         """The correction (3,) that :meth:`correct` would return; the state does not change."""
         pose, turn = self._predict(periods).whole_pose, float(self.displacement(periods)[2])
         gain = pose @ np.linalg.inv(pose + turn_covariance(covariance, turn))
-        return _rotate(gain @ _rotate(residual, turn), -turn)
+        return _turn(-turn) @ gain @ _turn(turn) @ residual
 
     def predict(self, periods: int = 1) -> tuple[FloatArray, FloatArray]:
         """Moves the state on by ``periods`` periods without a measurement.
@@ -123,8 +123,8 @@ class MotionFilter:
         rest = np.eye(3) - gain
         both = gain @ predicted.pose_and_shift @ rest.T
         step = gain @ (predicted.pose + measured) @ gain.T + rest @ predicted.shift @ rest.T - both - both.T
-        rotated = _rotate(residual, turn)
-        correction = _rotate(gain @ rotated, -turn)
+        rotated = _turn(turn) @ residual
+        correction = _turn(-turn) @ gain @ rotated
         after = turn + float(correction[2])
         self.motion = self.motion + motion_gain @ rotated
         self._store_errors(rest @ pose, rest @ cross, predicted.motion - motion_gain @ cross, after)
@@ -132,39 +132,50 @@ class MotionFilter:
         return correction, step, (taken_back + taken_back.T) / 2
 
     def _predict(self, periods: int) -> "_Predicted":
-        """The covariances at a scan that is ``periods`` periods later."""
+        """The covariances at a scan that is ``periods`` periods later.
+
+        The displacement after n periods depends on an error of the motion by the Jacobian ``own[n]``: each
+        period adds the error itself, and the error of the heading so far moves the end of the period. A
+        change of the motion acts from its period on, like an error over the periods that are left.
+        """
         motion, change = self._errors[3:, 3:], np.diag(np.square(self._change))
-        # An error of the heading also moves the end of the displacement.
-        x, y, _ = self.displacement(periods).tolist()
-        lever = np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
+        turns = [_turn(number * float(self.motion[2])) for number in range(periods)]
+        own = [np.eye(3)]
+        for turn in turns[1:]:
+            own.append(_lever(turn @ self.motion) @ own[-1] + turn)
+        lever, all_periods = _lever(self.displacement(periods)), own[-1]
+        changes = [turn @ own[periods - 1 - number] for number, turn in enumerate(turns)]
         both = lever @ self._errors[:3, 3:]
-        # A change of the motion in the first of n periods acts n times, one in the second n - 1 times, etc.
-        # This gives the sums of 1 to n and of their squares.
-        total = periods * (periods + 1) / 2
-        squared = total * (2 * periods + 1) / 3
         return _Predicted(
             pose=lever @ self._errors[:3, :3] @ lever.T,
-            shift=periods**2 * motion + squared * change,
-            pose_and_shift=periods * both,
+            shift=all_periods @ motion @ all_periods.T + sum(each @ change @ each.T for each in changes),
+            pose_and_shift=both @ all_periods.T,
             motion=motion + periods * change,
-            pose_and_motion=both + periods * motion + total * change,
+            pose_and_motion=both + all_periods @ motion + sum(changes) @ change,
         )
 
     def _store_errors(self, pose: FloatArray, both: FloatArray, motion: FloatArray, turn: float) -> None:
-        """Stores the covariances after a scan in the scan's own frame, which is turned by ``turn`` radians.
+        """Stores the covariances after a scan.
 
         Args:
-            pose, both, motion: (3, 3) of the pose, of pose and motion with each other, and of the motion, in
-                the frame of the scan before.
-            turn: heading of the scan in that frame.
+            pose, both: (3, 3) of the pose, and of pose and motion with each other, the pose in the frame of
+                the scan before; they are stored in the frame of the scan.
+            motion: (3, 3) of the motion, which goes with the laser and needs no other frame.
+            turn: heading of the scan in the frame of the scan before.
         """
-        for rows, columns, block in ((0, 0, pose), (0, 3, both), (3, 3, motion)):
-            self._errors[rows : rows + 3, columns : columns + 3] = turn_covariance(block, -turn)
-        self._errors[3:, :3] = self._errors[:3, 3:].T
+        back = _turn(-turn)
+        self._errors[:3, :3], self._errors[:3, 3:] = back @ pose @ back.T, back @ both
+        self._errors[3:, :3], self._errors[3:, 3:] = self._errors[:3, 3:].T, motion
         self._errors = (self._errors + self._errors.T) / 2
 
 
-def _rotate(values: FloatArray, turn: float) -> FloatArray:
-    """x, y and heading (3,), with x and y rotated counter-clockwise by ``turn`` radians."""
-    cos, sin = math.cos(turn), math.sin(turn)
-    return np.array([cos * values[0] - sin * values[1], sin * values[0] + cos * values[1], values[2]])
+def _turn(heading: float) -> FloatArray:
+    """The matrix (3, 3) that rotates x and y counter-clockwise by a heading in radians."""
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
+
+
+def _lever(displacement: FloatArray) -> FloatArray:
+    """The Jacobian (3, 3) of the end of a displacement (3,) with respect to the pose where it begins."""
+    x, y, _ = displacement.tolist()
+    return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])

@@ -63,6 +63,8 @@ class PairTracker:
         description: that of the model.
         period: seconds between scans in its training.
         beam_check: compares the beams of scans with the sensor and with earlier scans.
+        corrects_prediction: whether scans without returns came before the last one, so that its step also
+            corrects what was predicted for them.
     """
 
     def __init__(self, stepper: Stepper) -> None:
@@ -81,6 +83,9 @@ class PairTracker:
         self._present: npt.NDArray[np.float32] | None = None  # the last scan
         self._motion = np.zeros(3)  # the last estimated step over one period
         self._held, self._missed = 0, 0  # periods without an estimate, and without returns
+        self.corrects_prediction = False
+        self._is_lost = False  # whether the network has failed since the last estimate
+        self._is_predicted = True  # whether the stepper has predicted all periods without returns
         self._taken_back = np.zeros((3, 3))  # the part of the last step's error that the next step cancels
         self._beams, self._spacing = 0, 0.0
         # Rendering does not need the sensor's beams: there may be fewer, or they may cover only a part of it.
@@ -102,6 +107,7 @@ class PairTracker:
         notes: list[str] = []
         depth = self._encode(scan, notes)
         self._earlier, self._missed = (depth if depth.any() else None), 0
+        self._is_predicted = True
         return tuple(notes)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
@@ -113,27 +119,31 @@ class PairTracker:
             self._missed += periods
             return self._predict(periods, notes)
         pair, self._earlier = np.stack([self._earlier, depth]), depth
-        gap, self._missed = periods + self._missed, 0
-        is_compared = self._warping_stepper is not None and gap <= LONGEST_HOLD
-        if gap > 1:
-            action = "compared across it" if is_compared else "the last motion goes on"
-            notes.append(f"gap: {gap} periods after the last scan, {action}")
-            if not is_compared:
-                return self._hold(periods, notes)
+        gap, self.corrects_prediction, self._missed = periods + self._missed, self._missed > 0, 0
+        can_compare = self._warping_stepper is not None and self._is_predicted and gap <= LONGEST_HOLD
+        self._is_predicted = True  # from this scan on
+        note = f"gap: {gap} periods after the last scan"
+        if gap > 1 and not can_compare:
+            return self._hold(periods, [*notes, f"{note}, the last motion goes on"])
         step = self._warping_stepper(pair, periods) if self._warping_stepper else self._stepper(pair)
-        if not np.isfinite(step.array()).all():
+        self._is_lost = not np.isfinite(step.array()).all()
+        if self._is_lost:
             self._stepper.reset()  # its state is nan as well
             return self._hold(periods, [*notes, "no estimate: the last motion goes on"])
-        if periods == 1:
+        if gap == 1:
             self._motion = step.array()
+        else:
+            notes.append(f"{note}, compared across it")
         self._held, self._taken_back = 0, step.taken_back
         return Registered(step, tuple(notes))
 
     def _predict(self, periods: int, notes: list[str]) -> Registered:
         """The step to a scan without returns, which networks of residual motions predict themselves."""
-        if self._warping_stepper is None or self._held + periods > LONGEST_HOLD:
+        if self._warping_stepper is None or self._is_lost or self._held + periods > LONGEST_HOLD:
+            self._is_predicted = False
             return self._hold(periods, notes)
-        step = self._warping_stepper.predict(periods)
+        assert self._earlier is not None
+        step = self._warping_stepper.predict(self._earlier, periods)
         self._held, self._taken_back = self._held + periods, step.taken_back
         return Registered(step, tuple(notes), is_estimated=False)
 

@@ -62,8 +62,7 @@ class WarpingStepper:
             pair: (2, bins) metres, the earlier scan first.
             periods: usual periods between the two scans, without those that :meth:`predict` has covered.
         """
-        if self._last is None or not np.array_equal(pair[0], self._last):
-            self._take_key(pair[0])  # this is the first pair, or scans between the pairs were not used
+        self._begin_at(pair[0])
         expected = advance(self._pose, self._filter.displacement(periods))
         measured = self._measure(pair[1], expected, periods)
         if measured is None:
@@ -78,12 +77,24 @@ class WarpingStepper:
             taken_back = np.zeros((3, 3))
         return Step(x, y, heading, covariance, taken_back)
 
-    def predict(self, periods: int) -> Step:
-        """The step to a scan without returns, ``periods`` later, if the last motion goes on."""
+    def predict(self, earlier: npt.NDArray[np.float32], periods: int) -> Step:
+        """The step to a scan without returns, if the last motion goes on.
+
+        Args:
+            earlier: (bins,) metres, the last scan with returns.
+            periods: since the last scan, with or without returns.
+        """
+        self._begin_at(earlier)
         x, y, heading = self._filter.displacement(periods).tolist()
         covariance, taken_back = self._filter.predict(periods)
         self._pose = advance(self._pose, np.array([x, y, heading]))
         return Step(x, y, heading, covariance, taken_back)
+
+    def _begin_at(self, scan: npt.NDArray[np.float32]) -> None:
+        """Makes a scan (bins,) the key scan, unless it is the last one that the stepper has seen."""
+        if self._last is None or not np.array_equal(scan, self._last):
+            self._take_key(scan)  # the first scan, or scans between were not used
+            self._last = scan.copy()
 
     def _take_key(self, scan: npt.NDArray[np.float32]) -> None:
         """Makes a scan (bins,) the key scan, with which the next scans are compared."""

@@ -80,7 +80,7 @@ def find_commit(folder: Path = PACKAGE) -> str | None:
     if not commit:
         return None
     changed = _run_git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".")
-    return f"{commit}, with local changes" if changed else commit
+    return commit if changed == "" else f"{commit}, {'with' if changed else 'perhaps with'} local changes"
 
 
 def _run_git(folder: Path, *arguments: str) -> str | None:

@@ -105,8 +105,9 @@ def score_tag(group: str, metric: str, drive: str | None = None) -> str:
     'Validation: after each epoch/mean absolute distance error in m'
     """
     known = all_metrics()
-    title = TITLES.get(metric) or known[metric].title
-    unit = "deg/m" if metric == "r_err_deg_per_m" else known[metric].unit
+    title, unit = TITLES.get(metric, metric), "deg/m" if metric == "r_err_deg_per_m" else ""
+    if metric in known:
+        title, unit = TITLES.get(metric) or known[metric].title, known[metric].unit
     place = "" if drive is None else f", {ALL_DRIVES if drive == ALL_DRIVES else f'drive {drive}'}"
     return _without_parentheses(f"{group}{title}{f' in {unit}' if unit else ''}{place}")
 
