@@ -257,6 +257,8 @@ def test_a_killed_run_leaves_whole_lines(model, tmp_path):
 def test_a_run_that_is_stopped_by_hand_ends_with_the_three_lines(model, tmp_path):
     """On standard error, of the scans so far; the exit status says that it was stopped."""
     options = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
+    # A shell starts jobs in the background with this signal ignored, and so would the run.
+    options["preexec_fn"] = lambda: signal.signal(signal.SIGINT, signal.SIG_DFL)
     process = start("run", "--model", model, "--live", "--out", tmp_path / "out", **options)
     for number, scan in enumerate(random_scans(4).astype(np.float64)):
         process.stdin.write(json.dumps({"stamp": 0.1 * number, "ranges": scan.tolist()}) + "\n")

@@ -43,8 +43,9 @@ def drift_of_one_process(module, settings, split):
     trainer = stages.build_trainer(
         settings | {"trainer": settings["trainer"] | {"devices": 1, "strategy": "auto"}}
     )
-    [scores] = trainer.validate(module, data, verbose=False)
-    return {name: value for name, value in scores.items() if "drift" in name or "mae" in name}
+    trainer.validate(module, data, verbose=False)
+    scores = trainer.callback_metrics
+    return {name: float(value) for name, value in scores.items() if "drift" in name or "mae" in name}
 
 
 @pytest.mark.slow
