@@ -15,6 +15,7 @@ import yaml
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import METRICS
 from rcnn_odom.evaluation.scores import percent
+from rcnn_odom.evaluation.sweep_report.document import markdown_table
 
 PLACES = ("model=", "run_dir=", "outputs=", "+sweeps=")
 """Options that a row does not name: where an evaluation lies, and the model, which is named without them."""
@@ -34,9 +35,8 @@ def table(folder: Path) -> str:
     for path, report in zip(files, reports, strict=True):
         if list(report["test"]["sequences"]) != drives:
             raise InputError(f"{path}: of other drives than {files[0]}; give each folder its own table")
-    rows = [["drift in %", *drives], ["---", *["---:"] * len(drives)]]
-    rows += [[label, *drifts(report)] for label, report in zip(labels(files, reports), reports, strict=True)]
-    return "\n".join(f"| {' | '.join(row)} |" for row in rows)
+    rows = [[label, *drifts(report)] for label, report in zip(labels(files, reports), reports, strict=True)]
+    return markdown_table(["drift in %", *drives], rows)
 
 
 def labels(files: list[Path], reports: list[dict[str, Any]]) -> list[str]:

@@ -14,7 +14,6 @@ was measured. Where a command fails, its page stays as it was.
 
 import argparse
 import os
-import platform
 import re
 import subprocess
 import sys
@@ -27,6 +26,7 @@ from pathlib import Path
 
 from rcnn_odom.errors import InputError
 from rcnn_odom.files import write_atomically
+from rcnn_odom.training.provenance import find_commit, read_processor_name
 
 ROOT = Path(__file__).resolve().parent.parent
 BEGIN, END = "<!-- figures", "<!-- end of figures -->"
@@ -37,8 +37,6 @@ TAKEN = re.compile(r"^Commit .*, in ([^,]+)\.$", re.MULTILINE)
 """The time that a measurement took, in the line below a table."""
 WIDTH = 119
 """Most characters of a line of a page, tables excepted."""
-FEATURES = {"avx512f": "AVX-512", "avx512_bf16": "bf16"}
-"""What of a processor decides how fast networks are: flags of Linux and what they are called."""
 
 
 @dataclass(frozen=True)
@@ -100,11 +98,13 @@ def measure(commands: str) -> Measured:
     Raises:
         InputError: one of them failed, or the commit cannot be told.
     """
-    commit, start = find_commit(), time.monotonic()
+    if (commit := find_commit()) is None:
+        raise InputError(f"{ROOT}: git does not tell its commit; run this in a checkout")
+    start = time.monotonic()
     output = run(commands)
     minutes, seconds = divmod(round(time.monotonic() - start), 60)
     taken = f"{minutes} min {seconds} s" if minutes else f"{seconds} s"
-    return Measured(output, f"Commit {commit}, {find_processor()}, {date.today()}, in {taken}.")
+    return Measured(output, f"Commit {commit}, {read_processor_name()}, {date.today()}, in {taken}.")
 
 
 def run(commands: str) -> str:
@@ -160,35 +160,6 @@ def wrapped(text: str) -> str:
     """Text with its long lines broken, as those of a list."""
     lines = text.strip("\n").splitlines()
     return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="  ") for line in lines)
-
-
-def find_commit() -> str:
-    """The commit of the code, and whether there are changes beside it, those of pages and tests excepted.
-
-    Raises:
-        InputError: the folder is no checkout.
-    """
-    git = ["git", "--no-optional-locks", "-C", str(ROOT)]
-    name = [*git, "rev-parse", "--short=7", "HEAD"]
-    changes = [*git, "status", "--porcelain", "--", ".", ":!*.md", ":!tests"]
-    try:
-        commit, changed = (
-            subprocess.run(command, check=True, capture_output=True, text=True).stdout.strip()
-            for command in (name, changes)
-        )
-    except (OSError, subprocess.CalledProcessError) as error:
-        raise InputError(f"{ROOT}: git does not tell its commit; run this in a checkout") from error
-    return f"{commit} with later changes" if changed else commit
-
-
-def find_processor(info: Path = Path("/proc/cpuinfo")) -> str:
-    """The name of the processor, as Linux tells it, and its features."""
-    text = info.read_text("utf-8") if info.exists() else ""
-    found = re.search(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
-    name = re.sub(r"\((R|TM)\)|\bCPU\b.*|\bProcessor\b", " ", found[1] if found else platform.processor())
-    features = [shown for flag, shown in FEATURES.items() if re.search(rf"\b{flag}\b", text)]
-    name = " ".join(name.split()) or "processor not recorded"
-    return f"{name} ({', '.join(features)})" if features else name
 
 
 def print_commands(page: Path, block: re.Match[str]) -> None:

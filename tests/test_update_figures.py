@@ -3,7 +3,6 @@
 import json
 import os
 import re
-import subprocess
 
 import drift_table
 import pytest
@@ -21,7 +20,7 @@ PRINT_TABLES = r"""python -c "print('| a |\n| --- |\n| 1 |\n\n| b |\n| --- |\n| 
 def machine(monkeypatch):
     """The tests need neither git nor a processor of this name."""
     monkeypatch.setattr(update_figures, "find_commit", lambda: "abc1234")
-    monkeypatch.setattr(update_figures, "find_processor", lambda: "Intel Xeon (AVX-512)")
+    monkeypatch.setattr(update_figures, "read_processor_name", lambda: "Intel Xeon (AVX-512)")
 
 
 @pytest.fixture
@@ -163,43 +162,13 @@ def test_every_block_of_the_pages_says_where_its_tables_come_from():
         assert len(sources) == len(tables) > 0, block["commands"]
 
 
-@pytest.mark.parametrize(
-    ("name", "flags", "shown"),
-    [
-        ("Intel(R) Xeon(R) Processor", "sse avx512f avx512_bf16", "Intel Xeon (AVX-512, bf16)"),
-        ("Intel(R) Core(TM) i7-8550U CPU @ 1.80GHz", "sse avx2", "Intel Core i7-8550U"),
-        ("AMD EPYC 9R14 96-Core Processor", "avx512f avx512_bf16x", "AMD EPYC 9R14 96-Core (AVX-512)"),
-    ],
-)
-def test_names_of_processors(monkeypatch, tmp_path, name, flags, shown):
-    monkeypatch.undo()
-    info = tmp_path / "cpuinfo"
-    info.write_text(f"processor\t: 0\nmodel name\t: {name}\nflags\t\t: {flags}\n")
-    assert update_figures.find_processor(info) == shown
-
-
-def test_an_unknown_processor_is_not_made_up(monkeypatch, tmp_path):
-    monkeypatch.undo()
-    monkeypatch.setattr("platform.processor", lambda: "")
-    assert update_figures.find_processor(tmp_path / "none") == "processor not recorded"
-
-
-def test_the_commit_and_whether_there_are_changes_beside_it(monkeypatch, tmp_path):
-    monkeypatch.undo()
-    monkeypatch.setattr(update_figures, "ROOT", tmp_path)
-    with pytest.raises(InputError, match="run this in a checkout"):
-        update_figures.find_commit()
-    (tmp_path / "code.py").write_text("")
-    (tmp_path / "page.md").write_text("")
-    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
-    for command in (["init"], ["add", "."], ["commit", "--message=first"]):
-        subprocess.run([*git, *command], check=True, capture_output=True)
-    commit = update_figures.find_commit()
-    assert re.fullmatch("[0-9a-f]{7,}", commit)
-    (tmp_path / "page.md").write_text("changed")
-    assert update_figures.find_commit() == commit
-    (tmp_path / "code.py").write_text("changed = True")
-    assert update_figures.find_commit() == f"{commit} with later changes"
+def test_a_folder_that_git_does_not_know_leaves_the_page_as_it_was(write_page, monkeypatch, capsys):
+    monkeypatch.setattr(update_figures, "find_commit", lambda: None)
+    page = write_page(PRINT_TABLES)
+    before = page.read_text()
+    assert update_figures.main([str(page)]) == 1
+    assert page.read_text() == before
+    assert "run this in a checkout" in capsys.readouterr().err
 
 
 def write_evaluation(folder, variant, options, drifts):

@@ -2,7 +2,6 @@
 
 import re
 import shlex
-import subprocess
 from itertools import pairwise
 
 import numpy as np
@@ -175,17 +174,6 @@ def test_the_command_can_be_repeated(monkeypatch):
     assert shlex.split(command.replace("\\\n", "")) == ["rcnn-odom", "train", *options]
     assert 1 < len(command.splitlines()) < len(options)
     assert max(map(len, command.splitlines())) <= run_card.COMMAND_WIDTH + 2
-
-
-def test_the_commit_is_that_of_a_checkout_only(tmp_path):
-    (tmp_path / "__init__.py").touch()
-    assert run_card.find_commit(tmp_path) is None
-    git = ["git", "-C", str(ROOT), "rev-parse", "--short", "HEAD"]
-    try:
-        commit = subprocess.run(git, capture_output=True, text=True, check=True).stdout.strip()
-    except (OSError, subprocess.CalledProcessError):
-        pytest.skip("not a Git checkout")
-    assert run_card.find_commit() in (commit, f"{commit}, with local changes")
 
 
 def test_scores_of_other_packages_have_names(monkeypatch):

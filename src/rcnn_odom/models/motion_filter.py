@@ -12,6 +12,7 @@ class _Predicted(NamedTuple):
     """Predicted covariances (3, 3) of the errors at a later scan, in the frame of the last scan.
 
     Attributes:
+        periods: from the last scan to the later one.
         pose: part of the pose's covariance that comes from the pose of the last scan. All poses are relative
             to the key scan.
         shift: part that comes from the motion between the two scans.
@@ -20,6 +21,7 @@ class _Predicted(NamedTuple):
         pose_and_motion: cross-covariance of the whole error of the predicted pose and that of the motion.
     """
 
+    periods: int
     pose: FloatArray
     shift: FloatArray
     pose_and_shift: FloatArray
@@ -56,7 +58,7 @@ class MotionFilter:
     """
 
     def __init__(self, change: FloatArray, typical: FloatArray) -> None:
-        self._change, self._typical = change, typical
+        self._change, self._typical = np.diag(np.square(change)), typical
         self.begin()
 
     def begin(self) -> None:
@@ -65,10 +67,12 @@ class MotionFilter:
         # Covariance of pose and motion in the frame of the last scan.
         self._errors: FloatArray = np.zeros((6, 6))
         self._errors[3:, 3:] = np.diag(np.square(2 * self._typical))
+        self._predicted: _Predicted | None = None  # from this state; each comparison of a scan needs it
 
     def take_key(self) -> None:
         """Makes the last scan the key scan, so that its relative pose has no error."""
         self._errors[:3], self._errors[:, :3] = 0.0, 0.0
+        self._predicted = None
 
     @property
     def pose_covariance(self) -> FloatArray:
@@ -84,7 +88,7 @@ class MotionFilter:
 
     def weigh(self, residual: FloatArray, covariance: FloatArray, periods: int = 1) -> FloatArray:
         """The correction (3,) that :meth:`correct` would return; the state does not change."""
-        pose, turn = self._predict(periods).whole_pose, float(self.displacement(periods)[2])
+        pose, turn = self._predict(periods).whole_pose, periods * float(self.motion[2])
         gain = pose @ np.linalg.inv(pose + turn_covariance(covariance, turn))
         return _turn(-turn) @ gain @ _turn(turn) @ residual
 
@@ -96,7 +100,7 @@ class MotionFilter:
             the error that the next step cancels, in the new scan's frame. Here this is the whole error of the
             pose.
         """
-        turn, predicted = float(self.displacement(periods)[2]), self._predict(periods)
+        turn, predicted = periods * float(self.motion[2]), self._predict(periods)
         self._store_errors(predicted.whole_pose, predicted.pose_and_motion, predicted.motion, turn)
         return predicted.shift, self.pose_covariance
 
@@ -115,7 +119,7 @@ class MotionFilter:
             scan, in the frame of the scan before; and the covariance (3, 3) of the error that the next step
             cancels, in the new scan's frame (see :class:`rcnn_odom.geometry.Step`).
         """
-        predicted, turn = self._predict(periods), float(self.displacement(periods)[2])
+        predicted, turn = self._predict(periods), periods * float(self.motion[2])
         pose, cross = predicted.whole_pose, predicted.pose_and_motion
         measured = turn_covariance(covariance, turn)  # in the frame of the scan before, like all the others
         inverse = np.linalg.inv(pose + measured)
@@ -138,7 +142,9 @@ class MotionFilter:
         period adds the error itself, and the error of the heading so far moves the end of the period. A
         change of the motion acts from its period on, like an error over the periods that are left.
         """
-        motion, change = self._errors[3:, 3:], np.diag(np.square(self._change))
+        if self._predicted is not None and self._predicted.periods == periods:
+            return self._predicted
+        motion, change = self._errors[3:, 3:], self._change
         turns = [_turn(number * float(self.motion[2])) for number in range(periods)]
         own = [np.eye(3)]
         for turn in turns[1:]:
@@ -146,13 +152,15 @@ class MotionFilter:
         lever, all_periods = _lever(self.displacement(periods)), own[-1]
         changes = [turn @ own[periods - 1 - number] for number, turn in enumerate(turns)]
         both = lever @ self._errors[:3, 3:]
-        return _Predicted(
+        self._predicted = _Predicted(
+            periods,
             pose=lever @ self._errors[:3, :3] @ lever.T,
             shift=all_periods @ motion @ all_periods.T + sum(each @ change @ each.T for each in changes),
             pose_and_shift=both @ all_periods.T,
             motion=motion + periods * change,
             pose_and_motion=both + all_periods @ motion + sum(changes) @ change,
         )
+        return self._predicted
 
     def _store_errors(self, pose: FloatArray, both: FloatArray, motion: FloatArray, turn: float) -> None:
         """Stores the covariances after a scan.
@@ -167,6 +175,7 @@ class MotionFilter:
         self._errors[:3, :3], self._errors[:3, 3:] = back @ pose @ back.T, back @ both
         self._errors[3:, :3], self._errors[3:, 3:] = self._errors[:3, 3:].T, motion
         self._errors = (self._errors + self._errors.T) / 2
+        self._predicted = None
 
 
 def _turn(heading: float) -> FloatArray:

@@ -1,9 +1,8 @@
 """Hardware-dependent settings with automatic fallbacks."""
 
 import ctypes
-import platform
-import re
-from pathlib import Path
+
+import torch
 
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's ``mallopt``, from its ``malloc.h``."""
@@ -24,20 +23,9 @@ def keep_freed_memory() -> None:
 
 def resolve_precision(precision: str, accelerator: str) -> str:
     """Lightning's precision for ``auto``: bf16-mixed if the hardware multiplies bf16, else 32-true."""
-    import torch  # here, since the name of the processor is needed without torch
-
     if precision != "auto":
         return precision
     if accelerator != "cpu" and torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
     flags = torch.cpu.get_capabilities()
     return "bf16-mixed" if flags.get("avx512_bf16") or flags.get("amx_bf16") else "32-true"
-
-
-def read_processor_name() -> str:
-    """Name of the processor as the system gives it, with AVX-512 if it has that."""
-    info = Path("/proc/cpuinfo")
-    content = info.read_text("utf-8") if info.exists() else ""
-    found = re.search(r"model name\s*:\s*(.*)", content)
-    features = "AVX-512" if "avx512f" in content else ""
-    return " ".join(filter(None, [found[1] if found else platform.processor(), features]))

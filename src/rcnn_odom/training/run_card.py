@@ -2,7 +2,6 @@
 
 import platform
 import shlex
-import subprocess
 import sys
 from collections.abc import Mapping, Sequence
 from pathlib import Path
@@ -21,9 +20,8 @@ from rcnn_odom.evaluation.sweep_report.document import DASH, code, duration, mar
 from rcnn_odom.models.encoding import Sensor
 from rcnn_odom.recordings.recording import Drive
 from rcnn_odom.training.datamodule import OdometryDataModule
-from rcnn_odom.training.machine import read_processor_name
 from rcnn_odom.training.modules import OdometryModule, steps_per_epoch
-from rcnn_odom.training.run_state import PACKAGE
+from rcnn_odom.training.provenance import find_commit, read_processor_name
 
 GUIDE = """### How to read the charts
 
@@ -66,31 +64,6 @@ def find_command() -> str | None:
         else:
             lines.append(f"  {override}")
     return " \\\n".join(lines)
-
-
-def find_commit(folder: Path = PACKAGE) -> str | None:
-    """The Git commit of the source code in a folder, and whether files have changed since.
-
-    Returns:
-        For instance ``75c17ba, with local changes``. None if Git does not track the folder, for instance that
-        of an installed package.
-    """
-    tracked = _run_git(folder, "ls-files", "--error-unmatch", "__init__.py")
-    commit = tracked and _run_git(folder, "rev-parse", "--short", "HEAD")
-    if not commit:
-        return None
-    changed = _run_git(folder, "status", "--porcelain", "--untracked-files=no", "--", ".")
-    return commit if changed == "" else f"{commit}, {'with' if changed else 'perhaps with'} local changes"
-
-
-def _run_git(folder: Path, *arguments: str) -> str | None:
-    """The output of a Git command that only reads; None if it fails."""
-    command = ["git", "--no-optional-locks", "-C", str(folder), *arguments]
-    try:
-        done = subprocess.run(command, capture_output=True, text=True, timeout=10, check=True)
-    except (OSError, subprocess.SubprocessError):
-        return None
-    return done.stdout.strip()
 
 
 def name_processor(device: torch.device) -> str:

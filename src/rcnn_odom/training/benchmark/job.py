@@ -21,7 +21,7 @@ from rcnn_odom.training.benchmark.methods import find_method
 from rcnn_odom.training.benchmark.sets import load_sets
 from rcnn_odom.training.benchmark.table import as_markdown, as_text
 from rcnn_odom.training.job import in_sweep
-from rcnn_odom.training.machine import read_processor_name
+from rcnn_odom.training.provenance import read_processor_name
 from rcnn_odom.training.run_state import write_config, write_json
 from rcnn_odom.training.settings import plain
 from rcnn_odom.training.sweep import expected_folders
