@@ -161,7 +161,7 @@ def saved(outputs, which):
 @pytest.mark.slow
 def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, everyone):
     """By SIGTERM to the process that was started, or by Ctrl-C, which all in the terminal get."""
-    process = start(uneven, tmp_path / "stopped", 3)
+    process = start(uneven, tmp_path / "stopped", 2)
     for line in process.stdout:
         if line.startswith("epoch  1/"):
             break
@@ -177,9 +177,9 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
     step = saved(tmp_path / "stopped", LAST)["global_step"]
     if everyone:  # what follows is the same
         return
-    text, _ = start(uneven, tmp_path / "stopped", 3).communicate(timeout=200)
+    text, _ = start(uneven, tmp_path / "stopped", 2).communicate(timeout=200)
     assert f"step {step}\n" in text
-    start(uneven, tmp_path / "whole", 3).communicate(timeout=200)
+    start(uneven, tmp_path / "whole", 2).communicate(timeout=200)
     one, other = (saved(tmp_path / name, BEST)["state_dict"] for name in ("stopped", "whole"))
     assert all(torch.equal(value, other[name]) for name, value in one.items())
 
@@ -187,6 +187,7 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
 @pytest.mark.slow
 def test_processes_whose_time_is_up_are_scored_and_go_on_bit_for_bit(configure, uneven, tmp_path):
     options = ["model=cnn_cls", *uneven, "trainer=ddp", "model.batch_size=4", "model.epochs=1"]
+    options += ["model.averaging=0.7"]
     metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
     assert metrics["training"]["steps"] == 1
     assert metrics["training"]["stopped_by"] == "trainer.max_time"

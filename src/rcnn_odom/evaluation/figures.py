@@ -75,7 +75,7 @@ def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figur
         axes.set_ylabel(label)
         axes.grid(alpha=0.3)
     panels[0].legend(loc="upper right")
-    panels[1].set_xlabel("frame")
+    panels[1].set_xlabel("number of the scan in the drive")
     return figure
 
 
@@ -99,7 +99,10 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
         if len(known):
             share = np.searchsorted(known, times, side="right") / len(known)
             axes.plot(times, 100 * share, color=colour, label=label, linewidth=1.5)
-    axes.set(xlabel="estimated standard deviations", ylabel="frames whose error is within them (%)")
+    axes.set(
+        xlabel="size of the error, in estimated standard deviations",
+        ylabel="scans with an error up to that size (%)",
+    )
     axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
     axes.legend()
