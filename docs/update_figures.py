@@ -159,7 +159,9 @@ def as_markdown(measured: Measured, number: int | None) -> str:
 def wrapped(text: str) -> str:
     """Text with its long lines broken, as those of a list."""
     lines = text.strip("\n").splitlines()
-    return "\n".join(textwrap.fill(line, WIDTH, subsequent_indent="  ") for line in lines)
+    return "\n".join(
+        textwrap.fill(line, WIDTH, subsequent_indent="  ", break_on_hyphens=False) for line in lines
+    )
 
 
 def print_commands(page: Path, block: re.Match[str]) -> None:

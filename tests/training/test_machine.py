@@ -6,15 +6,22 @@ import sys
 import pytest
 import torch
 
+from rcnn_odom.training import machine
 from rcnn_odom.training.machine import resolve_precision
 
 
 @pytest.mark.parametrize(
-    ("capabilities", "expected"),
-    [({"avx512_bf16": True}, "bf16-mixed"), ({"amx_bf16": True}, "bf16-mixed"), ({"avx2": True}, "32-true")],
+    ("processor", "capabilities", "expected"),
+    [
+        ("AMD EPYC (AVX-512, bf16)", {"avx512_bf16": True}, "bf16-mixed"),
+        ("Intel Xeon (AVX-512, bf16)", {"avx512_bf16": True}, "32-true"),
+        ("Intel Xeon (AVX-512, bf16)", {"avx512_bf16": True, "amx_bf16": True}, "bf16-mixed"),
+        ("Intel Xeon (AVX2)", {"avx2": True}, "32-true"),
+    ],
 )
-def test_auto_precision_follows_the_processor(monkeypatch, capabilities, expected):
+def test_auto_precision_follows_the_processor(monkeypatch, processor, capabilities, expected):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
+    monkeypatch.setattr(machine, "read_processor_name", lambda: processor)
     assert resolve_precision("auto", "cpu") == expected
     assert resolve_precision("32-true", "cpu") == "32-true"
 
