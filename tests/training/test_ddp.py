@@ -161,7 +161,7 @@ def saved(outputs, which):
 @pytest.mark.slow
 def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, everyone):
     """By SIGTERM to the process that was started, or by Ctrl-C, which all in the terminal get."""
-    process = start(uneven, tmp_path / "stopped", 2)
+    process = start(uneven, tmp_path / "stopped", 3)
     for line in process.stdout:
         if line.startswith("epoch  1/"):
             break
@@ -177,9 +177,9 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
     step = saved(tmp_path / "stopped", LAST)["global_step"]
     if everyone:  # what follows is the same
         return
-    text, _ = start(uneven, tmp_path / "stopped", 2).communicate(timeout=200)
+    text, _ = start(uneven, tmp_path / "stopped", 3).communicate(timeout=200)
     assert f"step {step}\n" in text
-    start(uneven, tmp_path / "whole", 2).communicate(timeout=200)
+    start(uneven, tmp_path / "whole", 3).communicate(timeout=200)
     one, other = (saved(tmp_path / name, BEST)["state_dict"] for name in ("stopped", "whole"))
     assert all(torch.equal(value, other[name]) for name, value in one.items())
 

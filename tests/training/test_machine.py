@@ -11,17 +11,20 @@ from rcnn_odom.training.machine import resolve_precision
 
 
 @pytest.mark.parametrize(
-    ("processor", "capabilities", "expected"),
+    ("vendor", "capabilities", "expected"),
     [
-        ("AMD EPYC (AVX-512, bf16)", {"avx512_bf16": True}, "bf16-mixed"),
-        ("Intel Xeon (AVX-512, bf16)", {"avx512_bf16": True}, "32-true"),
-        ("Intel Xeon (AVX-512, bf16)", {"avx512_bf16": True, "amx_bf16": True}, "bf16-mixed"),
-        ("Intel Xeon (AVX2)", {"avx2": True}, "32-true"),
+        ("AuthenticAMD", {"avx512_bf16": True}, "bf16-mixed"),
+        ("GenuineIntel", {"avx512_bf16": True}, "32-true"),
+        ("GenuineIntel", {"avx512_bf16": True, "amx_bf16": True}, "bf16-mixed"),
+        ("AuthenticAMD", {"avx2": True}, "32-true"),
+        (None, {"avx512_bf16": True}, "32-true"),
     ],
 )
-def test_auto_precision_follows_the_processor(monkeypatch, processor, capabilities, expected):
+def test_auto_precision_follows_the_processor(monkeypatch, tmp_path, vendor, capabilities, expected):
     monkeypatch.setattr(torch.cpu, "get_capabilities", lambda: capabilities)
-    monkeypatch.setattr(machine, "read_processor_name", lambda: processor)
+    monkeypatch.setattr(machine, "CPU_INFO", tmp_path / "cpuinfo")
+    if vendor is not None:
+        (tmp_path / "cpuinfo").write_text(f"vendor_id\t: {vendor}\n")
     assert resolve_precision("auto", "cpu") == expected
     assert resolve_precision("32-true", "cpu") == "32-true"
 

@@ -1,13 +1,13 @@
 """Hardware-dependent settings with automatic fallbacks."""
 
 import ctypes
+from pathlib import Path
 
 import torch
 
-from rcnn_odom.training.provenance import read_processor_name
-
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's ``mallopt``, from its ``malloc.h``."""
+CPU_INFO = Path("/proc/cpuinfo")
 
 
 def keep_freed_memory() -> None:
@@ -27,12 +27,12 @@ def resolve_precision(precision: str, accelerator: str) -> str:
     """Lightning's precision for ``auto``: bf16-mixed if the hardware multiplies bf16 faster, else 32-true.
 
     AMD's AVX-512 and Intel's AMX multiply bf16 faster than fp32. Intel's AVX-512 takes bf16 as well, but is
-    slower with it: 80 against 148 GFLOP/s on a Xeon whose AMX a virtual machine hides (docs/training.md).
+    slower with it (``make bench-train``, docs/training.md).
     """
     if precision != "auto":
         return precision
     if accelerator != "cpu" and torch.cuda.is_available():
         return "bf16-mixed" if torch.cuda.is_bf16_supported(including_emulation=False) else "32-true"
     flags = torch.cpu.get_capabilities()
-    by_avx = flags.get("avx512_bf16") and "Intel" not in read_processor_name()
-    return "bf16-mixed" if flags.get("amx_bf16") or by_avx else "32-true"
+    is_amd = CPU_INFO.exists() and "AuthenticAMD" in CPU_INFO.read_text("utf-8")
+    return "bf16-mixed" if flags.get("amx_bf16") or (flags.get("avx512_bf16") and is_amd) else "32-true"
