@@ -191,6 +191,16 @@ def test_all_processes_have_the_same_average(configure, kitti, tmp_path, monkeyp
         assert not all(torch.equal(own[name], average[name]) for name in weights)
 
 
+@pytest.mark.slow
+def test_processes_whose_time_is_up_go_on_bit_for_bit(configure, kitti, tmp_path):
+    options = ["model=cnn_cls", *kitti, "trainer=ddp", AVERAGED]
+    metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
+    assert metrics["training"]["steps"] == 1
+    train(configure(*options))
+    train(configure(*options, run="whole"))
+    assert_same(*(result_of(tmp_path / "outputs" / name) for name in ("run", "whole")))
+
+
 def test_a_killed_training_goes_on_by_its_fingerprint(configure, kitti, tmp_path, monkeypatch):
     monkeypatch.setattr(saving, "SAVE_EVERY_SECONDS", -1.0)
     options = ["model=cnn_cls", *kitti]

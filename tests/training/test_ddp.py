@@ -187,7 +187,6 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
 @pytest.mark.slow
 def test_processes_whose_time_is_up_are_scored_and_go_on_bit_for_bit(configure, uneven, tmp_path):
     options = ["model=cnn_cls", *uneven, "trainer=ddp", "model.batch_size=4", "model.epochs=1"]
-    options += ["model.averaging=0.7"]
     metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
     assert metrics["training"]["steps"] == 1
     assert metrics["training"]["stopped_by"] == "trainer.max_time"

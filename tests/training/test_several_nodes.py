@@ -112,10 +112,11 @@ def assert_equal(one, other):
 @pytest.mark.parametrize(
     ("model", "starts"),
     [
+        ("cnn_reg", start_by_torchrun),
         ("rcnn_reg", start_by_torchrun),
         ("cnn_reg", lambda *args: start(*args, as_slurm)),
     ],
-    ids=["rcnn by torchrun", "cnn by the variables of Slurm"],
+    ids=["cnn by torchrun", "rcnn by torchrun", "cnn by the variables of Slurm"],
 )
 def test_two_nodes_score_as_one_process_and_log_once(configure, uneven, tmp_path, model, starts):  # noqa: F811
     options = [f"model={model}", *uneven, *(SMALL_RECURRENT if model == "rcnn_reg" else [])]

@@ -8,6 +8,7 @@ import torch
 M_TRIM_THRESHOLD, M_TOP_PAD, M_MMAP_THRESHOLD = -1, -2, -3
 """Parameters of glibc's ``mallopt``, from its ``malloc.h``."""
 CPU_INFO = Path("/proc/cpuinfo")
+"""What Linux says of the processor."""
 
 
 def keep_freed_memory() -> None:

@@ -5,6 +5,7 @@ import re
 import subprocess
 from pathlib import Path
 
+from rcnn_odom.training.machine import CPU_INFO
 from rcnn_odom.training.run_state import PACKAGE
 
 FEATURES = {"avx512f": "AVX-512", "avx512_bf16": "bf16"}
@@ -40,7 +41,7 @@ def _run_git(folder: Path, *arguments: str) -> str | None:
     return done.stdout.strip()
 
 
-def read_processor_name(info: Path = Path("/proc/cpuinfo")) -> str:
+def read_processor_name(info: Path = CPU_INFO) -> str:
     """The name of the processor and its features; ``processor not recorded`` if the system gives none."""
     text = info.read_text("utf-8") if info.exists() else ""
     found = re.search(r"^model name\s*:\s*(.*)$", text, re.MULTILINE)
