@@ -11,6 +11,12 @@ from rcnn_odom.models.motion_filter import MotionFilter
 CHANGE, TYPICAL = np.array([0.05, 0.02, 0.003]), np.array([1.0, 0.05, 0.02])
 
 
+def correct(motion_filter, residual, covariance, periods=1):
+    """The correction by a measurement, the covariance of the step, and the part of it that is taken back."""
+    weighed = motion_filter.weigh(residual, covariance, periods)
+    return weighed.correction, *motion_filter.correct(weighed)
+
+
 def textbook(measured, noise, change, first):
     """Poses along x of a filter of position and velocity, written with its usual matrices.
 
@@ -38,7 +44,7 @@ def test_along_a_line_it_is_the_textbooks():
     one, pose, got = MotionFilter(CHANGE, TYPICAL), np.zeros(3), []
     for place in measured:
         guess = advance(pose, one.motion)
-        believed, _, _ = one.correct(np.array([place - guess[0], 0.0, 0.0]), np.diag([0.09, 1e-4, 1e-6]))
+        believed, _, _ = correct(one, np.array([place - guess[0], 0.0, 0.0]), np.diag([0.09, 1e-4, 1e-6]))
         pose = advance(guess, believed)
         got.append((pose[0], one.pose_covariance[0, 0]))
     assert np.allclose(got, expected, rtol=1e-6)
@@ -61,7 +67,7 @@ def test_scans_that_are_missing_or_show_nothing_are_the_textbooks_predictions(lo
         for number, (one, so_many) in enumerate(((missing, periods), (empty, 1))):
             guess = advance(poses[number], one.displacement(so_many))
             residual = np.array([place - guess[0], 0.0, 0.0])
-            believed, _, _ = one.correct(residual, np.diag([0.09, 1e-4, 1e-6]), so_many)
+            believed, _, _ = correct(one, residual, np.diag([0.09, 1e-4, 1e-6]), so_many)
             poses[number] = advance(guess, believed)
             assert np.allclose((poses[number][0], one.pose_covariance[0, 0]), textbook_pose, rtol=1e-6)
         periods = 1
@@ -70,7 +76,7 @@ def test_scans_that_are_missing_or_show_nothing_are_the_textbooks_predictions(lo
 def test_what_is_measured_surely_is_believed_whole():
     one = MotionFilter(CHANGE, TYPICAL)
     residual, noise = np.array([0.9, 0.1, 0.05]), np.diag([1e-8, 1e-8, 1e-10])
-    believed, step, taken = one.correct(residual, noise)
+    believed, step, taken = correct(one, residual, noise)
     assert np.allclose(believed, residual, atol=1e-5)
     assert np.allclose(np.diag(step), [1e-8, 1e-8, 1e-10], rtol=1e-3)
     assert np.allclose(np.diag(taken), [1e-8, 1e-8, 1e-10], rtol=1e-3)
@@ -80,11 +86,11 @@ def test_what_is_measured_surely_is_believed_whole():
 def test_what_is_not_seen_goes_on_and_gets_less_sure():
     one = MotionFilter(CHANGE, TYPICAL)
     for _ in range(5):
-        one.correct(np.array([1.0, 0.0, 0.0]) - one.motion, np.diag([1e-4, 1e-4, 1e-6]))
+        correct(one, np.array([1.0, 0.0, 0.0]) - one.motion, np.diag([1e-4, 1e-4, 1e-6]))
     motion, deviations = one.motion, []
     for _ in range(100):
         # Nothing is seen along x, and what the network says there is always a little too far.
-        _, step, _ = one.correct(np.array([0.02, 0.0, 0.0]), np.diag([0.5, 1e-4, 1e-6]))
+        _, step, _ = correct(one, np.array([0.02, 0.0, 0.0]), np.diag([0.5, 1e-4, 1e-6]))
         deviations.append(math.sqrt(step[0, 0]))
     assert one.motion[0] - motion[0] < 0.2  # where taking all of it up would add 2
     assert deviations[50] > 2 * deviations[0]
@@ -94,8 +100,8 @@ def test_what_is_not_seen_goes_on_and_gets_less_sure():
 def test_a_prediction_over_periods_is_as_many_predictions(motion):
     at_once, one_by_one = MotionFilter(CHANGE, TYPICAL), MotionFilter(CHANGE, TYPICAL)
     for each in (at_once, one_by_one):
-        each.correct(np.array(motion), np.diag([1e-3, 1e-3, 1e-5]))
-        each.correct(np.zeros(3), np.diag([1e-3, 1e-3, 1e-5]))
+        correct(each, np.array(motion), np.diag([1e-3, 1e-3, 1e-5]))
+        correct(each, np.zeros(3), np.diag([1e-3, 1e-3, 1e-5]))
     displacement, pose = at_once.displacement(7), np.zeros(3)
     at_once.predict(7)
     for _ in range(7):
@@ -104,7 +110,7 @@ def test_a_prediction_over_periods_is_as_many_predictions(motion):
     assert np.allclose(displacement, pose)
     assert np.allclose(at_once.pose_covariance, one_by_one.pose_covariance, rtol=1e-9)
     # And so are the covariances with the motion, which decide what the next measurement corrects.
-    corrected = [each.correct(np.full(3, 0.1), np.diag([1e-3] * 3)) for each in (at_once, one_by_one)]
+    corrected = [correct(each, np.full(3, 0.1), np.diag([1e-3] * 3)) for each in (at_once, one_by_one)]
     for first, second in zip(*corrected, strict=True):
         assert np.allclose(first, second, rtol=1e-9)
     assert np.allclose(at_once.motion, one_by_one.motion, rtol=1e-9)
@@ -148,7 +154,7 @@ def test_covariances_are_those_of_drawn_errors(periods):
                 true = advance(true, motion)
             guess = advance(pose, one.displacement(so_many))
             measured = advance(true, noise * rng.standard_normal(3))
-            believed, step, _ = one.correct(relative_step(guess, measured), np.diag(noise**2), so_many)
+            believed, step, _ = correct(one, relative_step(guess, measured), np.diag(noise**2), so_many)
             before, pose = pose, advance(guess, believed)
         steps.append(
             (relative_step(before, pose) - relative_step(before_true, true)) / np.sqrt(np.diag(step))

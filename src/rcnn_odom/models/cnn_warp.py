@@ -164,11 +164,10 @@ class LocalConstraints(nn.Module):
             Motions (N, 3) and their information matrices (N, 3, 3), in :attr:`ResidualNetwork.units`.
         """
         with torch.autocast(features.device.type, enabled=False):
-            radial, tangential, lever, residual, log_weight = (
-                self.constraint(features.float()).squeeze(-2).unbind(1)
-            )
+            constraint = self.constraint(features.float()).squeeze(-2)  # (N, 5, places)
+            radial, tangential, lever, residual, log_weight = constraint.split(1, 1)
             weight = log_weight.clamp(*LOG_WEIGHT_BOUNDS).exp()
-            rows = torch.stack(
+            rows = torch.cat(
                 [
                     self.cos * radial - self.sin * tangential,
                     self.sin * radial + self.cos * tangential,
@@ -176,33 +175,34 @@ class LocalConstraints(nn.Module):
                 ],
                 1,
             )  # (N, 3, places)
-            weighted = rows * weight.unsqueeze(1)
+            weighted = rows * weight
             matrix = weighted @ rows.transpose(1, 2) + torch.diag(
                 self.log_prior.clamp(min=LEAST_LOG_PRIOR).exp()
             )
-            motion = invert(matrix) @ (weighted @ residual.unsqueeze(-1))
+            motion = invert(matrix) @ (weighted @ residual.transpose(1, 2))
             return motion.squeeze(-1), matrix
 
 
 def factor(matrix: Tensor) -> tuple[Tensor, ...]:
     """The Cholesky factors of symmetric positive definite matrices (..., 3, 3).
 
-    They are computed element by element, because ONNX has no operator for them. Pivots that rounding errors
-    would make negative are replaced by a millionth of the diagonal entry.
+    They are computed element by element, because ONNX has no operator for them. The elements keep a last
+    dimension of 1, since ONNX Runtime spends as much time on dropping and adding a dimension as on a product.
+    Pivots that rounding errors would make negative are replaced by a millionth of the diagonal entry.
 
     Returns:
-        The elements l11, l21, l22, l31, l32 and l33 of the factors, each of shape (...).
+        The elements l11, l21, l22, l31, l32 and l33 of the factors, each of shape (..., 1).
 
     Example:
         >>> [float(element) for element in factor(torch.diag(torch.tensor([4.0, 9.0, 16.0])))]
         [2.0, 0.0, 3.0, 0.0, 0.0, 4.0]
     """
-    a, b, c, d, e, f = (matrix[..., i, j] for i, j in ((0, 0), (1, 0), (1, 1), (2, 0), (2, 1), (2, 2)))
+    a, _, _, b, c, _, d, e, f = matrix.flatten(-2).split(1, -1)
     l11 = a.sqrt()
     l21, l31 = b / l11, d / l11
-    l22 = torch.maximum(c - l21.square(), ROUNDING * c).sqrt()
+    l22 = torch.maximum(c - l21 * l21, ROUNDING * c).sqrt()
     l32 = (e - l31 * l21) / l22
-    l33 = torch.maximum(f - l31.square() - l32.square(), ROUNDING * f).sqrt()
+    l33 = torch.maximum(f - l31 * l31 - l32 * l32, ROUNDING * f).sqrt()
     return l11, l21, l22, l31, l32, l33
 
 
@@ -219,9 +219,9 @@ def invert(matrix: Tensor) -> Tensor:
     m21 = -l21 * m11 * m22
     m32 = -l32 * m22 * m33
     m31 = -(l31 * m11 + l32 * m21) * m33
-    xx, xy, xh = m11.square() + m21.square() + m31.square(), m21 * m22 + m31 * m32, m31 * m33
-    yy, yh, hh = m22.square() + m32.square(), m32 * m33, m33.square()
-    return torch.stack([xx, xy, xh, xy, yy, yh, xh, yh, hh], -1).unflatten(-1, (3, 3))
+    xx, xy, xh = m11 * m11 + m21 * m21 + m31 * m31, m21 * m22 + m31 * m32, m31 * m33
+    yy, yh, hh = m22 * m22 + m32 * m32, m32 * m33, m33 * m33
+    return torch.cat([xx, xy, xh, xy, yy, yh, xh, yh, hh], -1).unflatten(-1, (3, 3))
 
 
 def log_determinant(matrix: Tensor) -> Tensor:
@@ -232,7 +232,7 @@ def log_determinant(matrix: Tensor) -> Tensor:
         2.0794
     """
     l11, _, l22, _, _, l33 = factor(matrix)
-    return 2 * (l11.log() + l22.log() + l33.log())
+    return 2 * (l11.log() + l22.log() + l33.log()).squeeze(-1)
 
 
 class ResidualNetwork(TrainedModel):

@@ -34,6 +34,28 @@ class _Predicted(NamedTuple):
         return self.pose + self.shift + self.pose_and_shift + self.pose_and_shift.T
 
 
+class Weighed(NamedTuple):
+    """A measurement of a scan's pose, weighed against the prediction.
+
+    Attributes:
+        correction: (3,) the corrected pose in the frame of the predicted one.
+        rotated: (3,) the measured residual, in the frame of the scan before like the following ones.
+        measured: (3, 3) covariance of the measurement.
+        inverse: (3, 3) inverse of the covariance of the difference between measurement and prediction.
+        gain: (3, 3) the Kalman gain of the pose.
+        predicted: the predicted covariances.
+        turn: the predicted turn to the scan in radians.
+    """
+
+    correction: FloatArray
+    rotated: FloatArray
+    measured: FloatArray
+    inverse: FloatArray
+    gain: FloatArray
+    predicted: _Predicted
+    turn: float
+
+
 class MotionFilter:
     """Predicts the pose of the next scan and corrects it by a measurement.
 
@@ -52,8 +74,9 @@ class MotionFilter:
         An accurate measurement, 1 m ahead of the predicted pose, is used almost unchanged:
 
         >>> motion_filter = MotionFilter(change=np.full(3, 0.1), typical=np.ones(3))
-        >>> correction, _, _ = motion_filter.correct(np.array([1.0, 0.0, 0.0]), 1e-8 * np.eye(3))
-        >>> correction.round(3).tolist(), motion_filter.motion.round(3).tolist()
+        >>> weighed = motion_filter.weigh(np.array([1.0, 0.0, 0.0]), 1e-8 * np.eye(3))
+        >>> _ = motion_filter.correct(weighed)
+        >>> weighed.correction.round(3).tolist(), motion_filter.motion.round(3).tolist()
         ([1.0, 0.0, 0.0], [1.0, 0.0, 0.0])
     """
 
@@ -86,11 +109,20 @@ class MotionFilter:
             displacement = advance(displacement, self.motion)
         return displacement
 
-    def weigh(self, residual: FloatArray, covariance: FloatArray, periods: int = 1) -> FloatArray:
-        """The correction (3,) that :meth:`correct` would return; the state does not change."""
-        pose, turn = self._predict(periods).whole_pose, periods * float(self.motion[2])
-        gain = pose @ np.linalg.inv(pose + turn_covariance(covariance, turn))
-        return _turn(-turn) @ gain @ _turn(turn) @ residual
+    def weigh(self, residual: FloatArray, covariance: FloatArray, periods: int = 1) -> Weighed:
+        """Weighs a measurement of the next scan's pose against the prediction; the state does not change.
+
+        Args:
+            residual: (3,) measured pose in the frame of the predicted pose.
+            covariance: (3, 3) of the residual, in the same frame.
+            periods: periods from the last scan to this one.
+        """
+        predicted, turn = self._predict(periods), periods * float(self.motion[2])
+        pose, towards = predicted.whole_pose, _turn(turn)
+        measured = turn_covariance(covariance, turn)  # in the frame of the scan before, like all the others
+        inverse = np.linalg.inv(pose + measured).astype(np.float64, copy=False)
+        gain, rotated = pose @ inverse, towards @ residual
+        return Weighed(towards.T @ gain @ rotated, rotated, measured, inverse, gain, predicted, turn)
 
     def predict(self, periods: int = 1) -> tuple[FloatArray, FloatArray]:
         """Moves the state on by ``periods`` periods without a measurement.
@@ -104,38 +136,34 @@ class MotionFilter:
         self._store_errors(predicted.whole_pose, predicted.pose_and_motion, predicted.motion, turn)
         return predicted.shift, self.pose_covariance
 
-    def correct(
-        self, residual: FloatArray, covariance: FloatArray, periods: int = 1
-    ) -> tuple[FloatArray, FloatArray, FloatArray]:
-        """Moves the state on to the next scan and corrects it by a measurement of that scan's pose.
+    def correct(self, weighed: Weighed) -> tuple[FloatArray, FloatArray]:
+        """Moves the state on to the next scan and corrects it by a weighed measurement of that scan's pose.
 
         Args:
-            residual: (3,) measured pose in the frame of the predicted pose.
-            covariance: (3, 3) of the residual, in the same frame.
-            periods: periods from the last scan to this one.
+            weighed: as :meth:`weigh` has returned it for the present state.
 
         Returns:
-            The correction (3,) in the frame of the predicted pose; the covariance (3, 3) of the step to the
-            scan, in the frame of the scan before; and the covariance (3, 3) of the error that the next step
-            cancels, in the new scan's frame (see :class:`rcnn_odom.geometry.Step`).
+            The covariance (3, 3) of the step to the scan, in the frame of the scan before; and the covariance
+            (3, 3) of the error that the next step cancels, in the new scan's frame (see
+            :class:`rcnn_odom.geometry.Step`).
         """
-        predicted, turn = self._predict(periods), periods * float(self.motion[2])
+        predicted, gain = weighed.predicted, weighed.gain
         pose, cross = predicted.whole_pose, predicted.pose_and_motion
-        measured = turn_covariance(covariance, turn)  # in the frame of the scan before, like all the others
-        inverse = np.linalg.inv(pose + measured)
-        gain, motion_gain = pose @ inverse, cross.T @ inverse
-        rest = np.eye(3) - gain
+        motion_gain, rest = cross.T @ weighed.inverse, np.eye(3) - gain
         both = gain @ predicted.pose_and_shift @ rest.T
-        step = gain @ (predicted.pose + measured) @ gain.T + rest @ predicted.shift @ rest.T - both - both.T
-        rotated = _turn(turn) @ residual
-        correction = _turn(-turn) @ gain @ rotated
-        after = turn + float(correction[2])
-        self.motion = self.motion + motion_gain @ rotated
+        step = (
+            gain @ (predicted.pose + weighed.measured) @ gain.T
+            + rest @ predicted.shift @ rest.T
+            - both
+            - both.T
+        )
+        after = weighed.turn + float(weighed.correction[2])
+        self.motion = self.motion + motion_gain @ weighed.rotated
         self._store_errors(rest @ pose, rest @ cross, predicted.motion - motion_gain @ cross, after)
         taken_back = turn_covariance(gain @ rest @ pose, -after)
-        return correction, step, (taken_back + taken_back.T) / 2
+        return step, (taken_back + taken_back.T) / 2
 
-    def _predict(self, periods: int) -> "_Predicted":
+    def _predict(self, periods: int) -> _Predicted:
         """The covariances at a scan that is ``periods`` periods later.
 
         The displacement after n periods depends on an error of the motion by the Jacobian ``own[n]``: each

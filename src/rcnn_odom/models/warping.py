@@ -9,7 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from rcnn_odom.geometry import FloatArray, Step, advance, relative_step, turn_covariance
-from rcnn_odom.models.motion_filter import MotionFilter
+from rcnn_odom.models.motion_filter import MotionFilter, Weighed
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
@@ -68,8 +68,8 @@ class WarpingStepper:
         if measured is None:
             self.reset()
             return Step(math.nan, math.nan, math.nan)
-        correction, covariance, taken_back = self._filter.correct(*measured, periods)
-        pose = advance(expected, correction)
+        covariance, taken_back = self._filter.correct(measured)
+        pose = advance(expected, measured.correction)
         x, y, heading = relative_step(self._pose, pose).tolist()
         self._last, self._pose = pair[1].copy(), pose
         if self.warping.needs_key(pose):
@@ -102,9 +102,7 @@ class WarpingStepper:
         self._pose = np.zeros(3)
         self._filter.take_key()
 
-    def _measure(
-        self, scan: npt.NDArray[np.float32], expected: FloatArray, periods: int
-    ) -> tuple[FloatArray, FloatArray] | None:
+    def _measure(self, scan: npt.NDArray[np.float32], expected: FloatArray, periods: int) -> Weighed | None:
         """Measures the pose of a scan by comparisons with the key scan, from better and better viewpoints.
 
         The viewpoint of each comparison is the filtered pose, not the measured one (an iterated Kalman
@@ -116,8 +114,8 @@ class WarpingStepper:
             periods: as in :meth:`__call__`.
 
         Returns:
-            The measured pose (3,) in the frame of the expected one, and its covariance (3, 3) in the frame of
-            the expected pose; None if the network gives nan or its corrections do not become small.
+            The measured pose in the frame of the expected one, weighed against it; None if the network gives
+            nan or its corrections do not become small.
         """
         now = render(scan, self.description.sensor, np.zeros(3), self._drawn)
         correction = np.zeros(3)
@@ -131,13 +129,14 @@ class WarpingStepper:
                 return None
             measured = relative_step(expected, advance(pose, residual.array()))
             covariance = turn_covariance(residual.covariance, float(measured[2]) - residual.heading)
+            weighed = self._filter.weigh(measured, covariance, periods)
             last, is_far_off = correction, self._size(residual.array()) > LARGEST_CORRECTION
-            correction = measured if is_far_off else self._filter.weigh(measured, covariance, periods)
+            correction = measured if is_far_off else weighed.correction
             if self._size(correction - last) < self.warping.settled:
                 break
         if number and is_far_off:
             return None  # the corrections do not converge
-        return measured, covariance
+        return weighed
 
     def _size(self, motion: FloatArray) -> float:
         """Length of a motion (3,) in metres, in which ``radians_a_metre`` of its turn count as one metre."""
