@@ -79,18 +79,31 @@ def test_killed_after_any_step_it_goes_on_bit_for_bit(
     if variant == "rcnn_reg":  # the first stage is the other variant's test
         train(configure("model=cnn_cls", *kitti, run="cnn"))
         options += [f"model.pretrained={tmp_path}/outputs/cnn/{BEST}", "model.batch_size=2", "model.stride=6"]
-    train(configure(*options, run="whole"))
-    whole = result_of(tmp_path / "outputs" / "whole")
+    outputs = tmp_path / "outputs"
+    copy_after_each_step(monkeypatch, outputs, lambda: train(configure(*options, run="whole")))
+    whole = result_of(outputs / "whole")
     epoch = 7 if variant == "cnn_cls" else 4
     for step in range(1, 2 * epoch + 1):
         run = f"killed_{step}"
-        kill_after(monkeypatch, step, lambda run=run: train(configure(*options, run=run)))
         with caplog.at_level("INFO"):
             train(configure(*options, run=run))
         # The validation belongs to the epoch's last step, after which nothing is saved before it.
         saved = step - 1 if step % epoch == 0 else step
-        assert f"continuing from {tmp_path}/outputs/{run}/{LAST}, step {saved}\n" in caplog.text
-        assert_same(result_of(tmp_path / "outputs" / run), whole)
+        assert f"continuing from {outputs}/{run}/{LAST}, step {saved}\n" in caplog.text
+        assert_same(result_of(outputs / run), whole)
+
+
+def copy_after_each_step(monkeypatch, outputs, train_it):
+    """Runs a training and keeps what ``kill -9`` would leave of its folder after each step."""
+    batch_end = saving.Saving.on_train_batch_end
+
+    def copy(self, trainer, *arguments):
+        batch_end(self, trainer, *arguments)
+        shutil.copytree(outputs / "whole", outputs / f"killed_{trainer.global_step}")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(saving.Saving, "on_train_batch_end", copy)
+        train_it()
 
 
 def kill_after(monkeypatch, step, train_it):
