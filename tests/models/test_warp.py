@@ -401,31 +401,64 @@ def test_places_look_where_their_features_come_from():
 
 def test_constraints_turn_with_what_is_seen():
     torch.manual_seed(0)
-    head = LocalConstraints(8, 30.0 * np.arange(12), Sensor(resolution_deg=1.0))
+    head = LocalConstraints(8, 30.0 * np.arange(12), Sensor(resolution_deg=1.0), 0.05)
     torch.nn.init.normal_(head.constraint.weight)
-    features = torch.randn(1, 8, 1, 12)
-    motion, matrix = head(features)
+    features, scans = torch.randn(1, 8, 1, 12), torch.full((1, 2, 361), 5.0)
+    motion, matrix = head(features, scans)
     # The same things, seen a quarter of a turn further to the left.
-    turned, turned_matrix = head(torch.roll(features, 3, -1))
+    turned, turned_matrix = head(torch.roll(features, 3, -1), scans)
     quarter = torch.tensor([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert torch.allclose(turned[0], quarter @ motion[0], atol=1e-5)
     assert torch.allclose(turned_matrix[0], quarter @ matrix[0] @ quarter.T, rtol=1e-4, atol=1e-4)
 
 
+def test_constraints_of_points_give_the_motion_that_moves_them():
+    """Lever arms and signs, against points that are seen from another pose."""
+    rng = np.random.default_rng(0)
+    sensor, places = Sensor(resolution_deg=1.0), 10.0 * np.arange(36) + 4.5
+    motion = np.array([0.02, -0.01, 0.003])  # ahead, to the left, counter-clockwise
+    bearings, ranges = np.deg2rad(-180 + places), rng.uniform(2, 20, 36)
+    points = ranges[:, None] * np.stack([np.cos(bearings), np.sin(bearings)], 1)
+    seen = (points - motion[:2]) @ rotation(motion[2])  # a row times the matrix: turned back
+    normals = rng.standard_normal((36, 2))
+    radial = (normals * points).sum(1) / ranges
+    tangential = (normals[:, 1] * points[:, 0] - normals[:, 0] * points[:, 1]) / ranges
+    offsets = -(normals * (seen - points)).sum(1)
+    head = LocalConstraints(4, places, sensor, 0.05)
+    head.constraint.weight.data.copy_(torch.eye(4)[:, :, None, None])
+    head.constraint.bias.data.zero_()
+    weights = np.full(36, 8.0)  # so large that the prior does not matter
+    features = torch.from_numpy(np.stack([radial, tangential, offsets, weights])).float()[None, :, None]
+    scan = np.zeros(sensor.bins, np.float32)
+    scan[:360] = np.repeat(ranges, 10)
+    scan[:360:3] = 0  # the mean is that of the returns alone
+    found, _ = head(features, torch.from_numpy(np.stack([scan, scan]))[None])
+    assert np.allclose(found[0].detach() * torch.tensor([1, 1, 0.05]), motion, atol=2e-4)
+    scan[:] = 0
+    nothing, without = head(features, torch.from_numpy(np.stack([scan, scan]))[None])
+    assert not nothing.any()
+    assert torch.equal(without, torch.eye(3)[None])
+
+
+def rotation(heading):
+    cos, sin = math.cos(heading), math.sin(heading)
+    return np.array([[cos, -sin], [sin, cos]])
+
+
 def test_constraints_are_solved_by_least_squares():
     """Against numpy's solution of the same rows, with the prior as rows of their own."""
     torch.manual_seed(1)
-    head = LocalConstraints(4, 18.0 * np.arange(20), SENSOR)
+    head = LocalConstraints(4, 18.0 * np.arange(20), SENSOR, 0.05)
     torch.nn.init.normal_(head.constraint.weight)
     features = torch.randn(1, 4, 1, 20)
-    radial, tangential, lever, residual, log_weight = head.constraint(features)[0, :, 0].detach().double()
+    radial, tangential, residual, log_weight = head.constraint(features)[0, :, 0].detach().double()
     bearings = np.deg2rad(-180 + 18 * np.arange(20))
     cos, sin = np.cos(bearings), np.sin(bearings)
     rows = np.stack(
         [
             cos * radial.numpy() - sin * tangential.numpy(),
             sin * radial.numpy() + cos * tangential.numpy(),
-            lever.numpy(),
+            0.05 * 7.0 * tangential.numpy(),
         ],
         1,
     )
@@ -435,7 +468,7 @@ def test_constraints_are_solved_by_least_squares():
         np.append(residual.numpy() * root, np.zeros(3)),
     )
     expected = np.linalg.lstsq(left, right, rcond=None)[0]
-    motion, matrix = head(features)
+    motion, matrix = head(features, torch.full((1, 2, SENSOR.bins), 7.0))
     assert np.allclose(motion[0].detach(), expected, atol=1e-4)
     assert np.allclose(matrix[0].detach(), left.T @ left, rtol=1e-4, atol=1e-4)
 

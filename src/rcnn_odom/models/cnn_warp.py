@@ -51,6 +51,8 @@ LOG_WEIGHT_BOUNDS, LEAST_LOG_PRIOR = (-12.0, 8.0), -4.0
 
 Outside these bounds, fp32 is not accurate enough to solve the normal equations.
 """
+RANGES_A_PLACE = 8
+"""Number of bins, evenly spread, whose mean range gives the lever arm of a constraint."""
 ROUNDING = 1e-6
 """Relative rounding error of a matrix entry in fp32."""
 LIKELIHOOD_WEIGHT = 0.05
@@ -129,49 +131,63 @@ def compare(pairs: Tensor, sensor: Sensor) -> Tensor:
 class LocalConstraints(nn.Module):
     """The residual motion as the weighted least-squares solution of one constraint at each position.
 
-    At each position of the encoder's output the network gives a direction u (radial and tangential, of any
-    length), a lever arm l for the heading, a residual r and a logarithmic weight. The constraint is
-    r = u . (x, y) + l * heading. A prior with learned weights pulls the solution towards zero, i.e. towards
-    the guess. The normal equations are those of a Gauss-Newton step of point-to-line matching, but all their
-    terms are learned. The inverse of their matrix is the covariance.
+    At each position of the encoder's output the network gives a direction u (its radial and tangential parts,
+    of any length), a residual r and a logarithmic weight. The constraint is r = u . (x, y) + l * heading. The
+    lever arm l of the heading is the tangential part times the range of the surface there: turning the laser
+    moves a point at that range sideways by so much. The weight counts as far as both scans have returns
+    there, so that a position where nothing is seen says nothing. A prior with learned weights pulls the
+    solution towards zero, i.e. towards the guess. The normal equations are those of a Gauss-Newton step of
+    point-to-line matching, but directions, residuals and weights are learned. The inverse of their matrix is
+    the covariance.
 
     Args:
         features: channels of the encoder's output.
         places: (places,) centre of each output position, in bins, with fractions.
         sensor: defines the bins of the rendered scans.
+        radians_a_metre: unit of the heading, in radians.
     """
 
     cos: Tensor
     sin: Tensor
+    near: Tensor
 
-    def __init__(self, features: int, places: FloatArray, sensor: Sensor) -> None:
+    def __init__(self, features: int, places: FloatArray, sensor: Sensor, radians_a_metre: float) -> None:
         super().__init__()
-        self.constraint = nn.Conv2d(features, 5, 1)
+        self.radians_a_metre = radians_a_metre
+        self.constraint = nn.Conv2d(features, 4, 1)
         nn.init.normal_(self.constraint.weight, 0, 0.02)
-        nn.init.zeros_(self.constraint.bias)  # type: ignore[arg-type]
+        # Before training, every constraint is radial. From tiny random directions, some trainings never learn
+        # to measure the heading (docs/warp.md).
+        assert self.constraint.bias is not None
+        self.constraint.bias.data.copy_(torch.tensor([1.0, 0.0, 0.0, 0.0]))
         self.log_prior = nn.Parameter(torch.zeros(3))
         bearings = np.deg2rad(sensor.first_bin_deg + sensor.resolution_deg * places)
+        spread = (np.arange(RANGES_A_PLACE) + 0.5) / RANGES_A_PLACE - 0.5
+        near = np.rint(places[:, None] + np.mean(np.diff(places)) * spread).clip(0, sensor.bins - 1)
         self.register_buffer("cos", torch.from_numpy(np.cos(bearings)).float(), persistent=False)
         self.register_buffer("sin", torch.from_numpy(np.sin(bearings)).float(), persistent=False)
+        self.register_buffer("near", torch.from_numpy(near).long(), persistent=False)
 
-    def forward(self, features: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, features: Tensor, pairs: Tensor) -> tuple[Tensor, Tensor]:
         """Solves for the residual motions.
 
         Args:
             features: (N, C, 1, places) output of the encoder.
+            pairs: (N, 2, bins) the rendered scans in metres, 0 without a return; the earlier is the first.
 
         Returns:
             Motions (N, 3) and their information matrices (N, 3, 3), in :attr:`ResidualNetwork.units`.
         """
         with torch.autocast(features.device.type, enabled=False):
-            constraint = self.constraint(features.float()).squeeze(-2)  # (N, 5, places)
-            radial, tangential, lever, residual, log_weight = constraint.split(1, 1)
-            weight = log_weight.clamp(*LOG_WEIGHT_BOUNDS).exp()
+            constraint = self.constraint(features.float()).squeeze(-2)  # (N, 4, places)
+            radial, tangential, residual, log_weight = constraint.split(1, 1)
+            ranges, share = self.look_around(pairs)
+            weight = log_weight.clamp(*LOG_WEIGHT_BOUNDS).exp() * share
             rows = torch.cat(
                 [
                     self.cos * radial - self.sin * tangential,
                     self.sin * radial + self.cos * tangential,
-                    lever,
+                    tangential * ranges * self.radians_a_metre,
                 ],
                 1,
             )  # (N, 3, places)
@@ -181,6 +197,18 @@ class LocalConstraints(nn.Module):
             )
             motion = invert(matrix) @ (weighted @ residual.transpose(1, 2))
             return motion.squeeze(-1), matrix
+
+    def look_around(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
+        """What pairs of scans (N, 2, bins) have around each position.
+
+        Returns:
+            The mean range (N, 1, places) of the later scan in metres, 0 without a return, and the share
+            (N, 1, places) of the bins in which both scans have a return.
+        """
+        near = pairs[..., self.near]  # (N, 2, places, RANGES_A_PLACE)
+        now = near[:, 1:]
+        ranges = now.sum(-1) / (now > 0).sum(-1).clamp(min=1)
+        return ranges, (near.amin(1, keepdim=True) > 0).float().mean(-1)
 
 
 def factor(matrix: Tensor) -> tuple[Tensor, ...]:
@@ -454,12 +482,15 @@ class CNNWarp(ResidualNetwork):
     def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
         super().__init__(options, sensor)
         self.encoder = Encoder(self.drawn, options["kernel_size"], options["pooling"], CHANNELS)
-        self.head = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
+        self.head = LocalConstraints(
+            self.encoder.channels, self.encoder.places, self.drawn, options["radians_a_metre"]
+        )
 
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
         """Motions (B, T, 3) and their information matrices (B, T, 3, 3), in ``units``, and the state."""
-        features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
-        motion, matrix = self.head(features)
+        flat = pairs.flatten(0, -3)
+        features = self.encoder.convolve(compare(flat, self.drawn))
+        motion, matrix = self.head(features, flat)
         return motion.unflatten(0, pairs.shape[:-2]), matrix.unflatten(0, pairs.shape[:-2]), state
 
     def loss(self, batch: Batch) -> dict[str, Tensor]:

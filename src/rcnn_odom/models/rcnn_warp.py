@@ -65,7 +65,9 @@ class RCNNWarp(ResidualNetwork):
     def __init__(self, options: dict[str, Any], sensor: Sensor) -> None:
         super().__init__(options, sensor)
         self.encoder = Encoder(self.drawn, options["kernel_size"], options["pooling"], CHANNELS)
-        self.constraints = LocalConstraints(self.encoder.channels, self.encoder.places, self.drawn)
+        self.constraints = LocalConstraints(
+            self.encoder.channels, self.encoder.places, self.drawn, options["radians_a_metre"]
+        )
         for part in (self.encoder, self.constraints):
             part.requires_grad_(not options["freeze"])
         self.projection = nn.Linear(self.encoder.features, options["projection"])
@@ -79,8 +81,9 @@ class RCNNWarp(ResidualNetwork):
 
     def measure(self, pairs: Tensor, state: State = ()) -> tuple[Tensor, Tensor, State]:
         """Motions (B, T, 3), their information matrices (B, T, 3, 3), in ``units``, and the LSTM's state."""
-        features = self.encoder.convolve(compare(pairs.flatten(0, -3), self.drawn))
-        motion, matrix = self.constraints(features)
+        flat = pairs.flatten(0, -3)
+        features = self.encoder.convolve(compare(flat, self.drawn))
+        motion, matrix = self.constraints(features, flat)
         deviations = invert(matrix).diagonal(dim1=-2, dim2=-1).sqrt()
         first = torch.cat([torch.asinh(motion / deviations), deviations.log()], -1)
         inputs = torch.cat([self.projection(features.flatten(1)).float(), first], -1)
@@ -104,7 +107,7 @@ class RCNNWarp(ResidualNetwork):
             InputError: an option of its network differs from that of this model.
         """
         assert isinstance(model, CNNWarp)
-        for key in ("kernel_size", "pooling", "resolution_deg"):
+        for key in ("kernel_size", "pooling", "resolution_deg", "radians_a_metre"):
             if model.options[key] != self.options[key]:
                 raise InputError(
                     f"trained with {key}={model.options[key]}, but model.{key} is {self.options[key]}; "
