@@ -8,9 +8,12 @@ Another package registers its own by Python's entry points, in its ``pyproject.t
 See docs/extending.md.
 """
 
-from collections.abc import Callable, Iterator, Mapping
+import sys
+from collections.abc import Callable, Iterable, Iterator, Mapping
+from functools import lru_cache
 from importlib import import_module
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from pkgutil import iter_modules
 from types import ModuleType
 from typing import Any
@@ -54,7 +57,7 @@ def collect(
         'the built-in one'
     """
     found = dict(built_in)
-    for entry in entry_points(group=f"rcnn_odom.{kind.replace(' ', '_')}s"):
+    for entry in entries_of(f"rcnn_odom.{kind.replace(' ', '_')}s"):
         if entry.name in found:
             raise InputError(
                 f"two {kind}s are called {entry.name}, one of them {entry.value}; rename it in the entry "
@@ -65,6 +68,25 @@ def collect(
             found[entry.name] = _load(kind, entry)
             check(entry.name, found[entry.name])
     return found
+
+
+def entries_of(group: str) -> Iterable[EntryPoint]:
+    """The entry points of a group, of all installed packages."""
+    return _read_entries(group, tuple((folder, _changed(Path(folder))) for folder in sys.path))
+
+
+def _changed(folder: Path) -> int | None:
+    """When a folder has changed, as by the installation of a package; None without such a folder."""
+    try:
+        return folder.stat().st_mtime_ns
+    except OSError:
+        return None
+
+
+@lru_cache(maxsize=64)
+def _read_entries(group: str, search_path: tuple[tuple[str, int | None], ...]) -> tuple[EntryPoint, ...]:
+    """Reads the entry points of all packages; cached, since a run asks for the metrics some fifty times."""
+    return tuple(entry_points(group=group))
 
 
 def _load(kind: str, entry: EntryPoint) -> Any:

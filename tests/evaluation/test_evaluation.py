@@ -422,7 +422,7 @@ def add_metrics(monkeypatch, **added):
         for name, metric in added.items()
     ]
     find = {"rcnn_odom.metrics": entries}.__getitem__
-    monkeypatch.setattr(registry, "entry_points", lambda group: find(group))
+    monkeypatch.setattr(registry, "entries_of", find)
 
 
 def test_a_metric_of_another_package_is_everywhere(monkeypatch, tmp_path):

@@ -9,6 +9,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from enum import Enum, auto
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -301,13 +302,19 @@ def hash_statements(sources: Iterable[Path]) -> str:
     """Hash of the statements in source files, in the given order."""
     statements = hashlib.sha256()
     for path in sources:
-        tree = ast.parse(path.read_bytes())
-        for node in ast.walk(tree):
-            body = getattr(node, "body", None)
-            if isinstance(body, list):  # A constant alone, such as a docstring, has no effect.
-                node.body = [one for one in body if not _is_constant(one)]  # type: ignore[attr-defined]
-        statements.update(f"{path.name}: {ast.dump(tree)}\n".encode())
+        statements.update(f"{path.name}: {_hash_source(path.read_bytes())}\n".encode())
     return statements.hexdigest()[:16]
+
+
+@lru_cache(maxsize=1024)
+def _hash_source(source: bytes) -> str:
+    """Hash of the statements of a source file; cached, since parsing the package takes half a second."""
+    tree = ast.parse(source)
+    for node in ast.walk(tree):
+        body = getattr(node, "body", None)
+        if isinstance(body, list):  # A constant alone, such as a docstring, has no effect.
+            node.body = [one for one in body if not _is_constant(one)]  # type: ignore[attr-defined]
+    return hashlib.sha256(ast.dump(tree).encode()).hexdigest()
 
 
 def _is_constant(statement: ast.stmt) -> bool:
