@@ -440,6 +440,15 @@ def test_constraints_of_points_give_the_motion_that_moves_them():
     assert torch.equal(without, torch.eye(3)[None])
 
 
+def test_the_only_position_looks_at_the_whole_scan():
+    head = LocalConstraints(4, np.array([3.0]), Sensor(resolution_deg=45.0), 0.05)
+    pairs = torch.full((1, 2, 9), 4.0)
+    pairs[:, 0, 5:] = 0
+    ranges, share = head.look_around(pairs)
+    assert ranges.tolist() == [[[4.0]]]
+    assert 0.4 < share.item() < 0.9
+
+
 def rotation(heading):
     cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, -sin], [sin, cos]])

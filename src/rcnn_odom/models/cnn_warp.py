@@ -163,7 +163,8 @@ class LocalConstraints(nn.Module):
         self.log_prior = nn.Parameter(torch.zeros(3))
         bearings = np.deg2rad(sensor.first_bin_deg + sensor.resolution_deg * places)
         spread = (np.arange(RANGES_A_PLACE) + 0.5) / RANGES_A_PLACE - 0.5
-        near = np.rint(places[:, None] + np.mean(np.diff(places)) * spread).clip(0, sensor.bins - 1)
+        width = np.diff(places).mean() if len(places) > 1 else sensor.bins
+        near = np.rint(places[:, None] + width * spread).clip(0, sensor.bins - 1)
         self.register_buffer("cos", torch.from_numpy(np.cos(bearings)).float(), persistent=False)
         self.register_buffer("sin", torch.from_numpy(np.sin(bearings)).float(), persistent=False)
         self.register_buffer("near", torch.from_numpy(near).long(), persistent=False)
@@ -215,8 +216,8 @@ def factor(matrix: Tensor) -> tuple[Tensor, ...]:
     """The Cholesky factors of symmetric positive definite matrices (..., 3, 3).
 
     They are computed element by element, because ONNX has no operator for them. The elements keep a last
-    dimension of 1, since ONNX Runtime spends as much time on dropping and adding a dimension as on a product.
-    Pivots that rounding errors would make negative are replaced by a millionth of the diagonal entry.
+    dimension of 1, which saves the exported graph the nodes that drop and add it. Pivots that rounding errors
+    would make negative are replaced by a millionth of the diagonal entry.
 
     Returns:
         The elements l11, l21, l22, l31, l32 and l33 of the factors, each of shape (..., 1).

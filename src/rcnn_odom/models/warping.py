@@ -64,12 +64,12 @@ class WarpingStepper:
         """
         self._begin_at(pair[0])
         expected = advance(self._pose, self._filter.displacement(periods))
-        measured = self._measure(pair[1], expected, periods)
-        if measured is None:
+        weighed = self._measure(pair[1], expected, periods)
+        if weighed is None:
             self.reset()
             return Step(math.nan, math.nan, math.nan)
-        covariance, taken_back = self._filter.correct(measured)
-        pose = advance(expected, measured.correction)
+        covariance, taken_back = self._filter.correct(weighed)
+        pose = advance(expected, weighed.correction)
         x, y, heading = relative_step(self._pose, pose).tolist()
         self._last, self._pose = pair[1].copy(), pose
         if self.warping.needs_key(pose):
