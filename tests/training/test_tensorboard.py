@@ -2,16 +2,13 @@
 
 import re
 import shlex
-from itertools import pairwise
 
-import numpy as np
 import pytest
 from hydra import compose, initialize_config_dir
 from hydra.core.hydra_config import HydraConfig
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
 from conftest import ROOT, configure_in
-from rcnn_odom.evaluation.figures import new_figure
 from rcnn_odom.evaluation.metrics import Metric
 from rcnn_odom.evaluation.scores import percent
 from rcnn_odom.training import run_card, tensorboard
@@ -181,26 +178,3 @@ def test_scores_of_other_packages_have_names(monkeypatch):
     monkeypatch.setattr(tensorboard, "all_metrics", lambda: {"jerk": metric})
     name = "Validation: after each epoch/jerk [peak] in m/s"
     assert tensorboard.validation_scalars({"val/jerk": 0.5, "loss": 1.0}) == {name: 5.0}
-
-
-@pytest.mark.parametrize("rows", [1, 2])
-def test_figures_have_text_of_a_readable_size_and_cut_none(rows):
-    figure, panels = new_figure(11, 6, nrows=rows)
-    title = "a title of so many words that it needs more than one line of a small figure"
-    for axes in np.atleast_1d(panels):
-        axes.set(xlabel="frame", ylabel="heading change (degrees)")
-    if rows == 1:
-        panels.set_title(title)
-    else:
-        figure.suptitle(title)
-    tensorboard.fit_figure(figure)
-    figure.draw_without_rendering()
-    width, height = figure.get_size_inches() * figure.dpi
-    assert figure.get_size_inches()[0] < 6  # inches, for text of 10 points
-    texts = [text for text in figure.findobj(lambda artist: hasattr(artist, "get_text")) if text.get_text()]
-    for text in texts:
-        box = text.get_window_extent()
-        assert -1 <= box.x0 <= box.x1 <= width + 1, text
-        assert -1 <= box.y0 <= box.y1 <= height + 1, text
-    labels = [axes.yaxis.label.get_window_extent() for axes in np.atleast_1d(panels)]
-    assert all(upper.y0 >= lower.y1 for upper, lower in pairwise(labels))

@@ -1,5 +1,6 @@
 """Figures: the trajectories and frame motions of the paper, coverage of errors, and a map of scans."""
 
+from textwrap import fill
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -15,6 +16,11 @@ TRUTH, ESTIMATE = "tab:blue", "tab:red"
 """The colours of the paper's figures."""
 PATH_COLOURS = ("#3b1fa8", "#0a7fd0", "#009e73", "#e08a00", "#c8102e")
 """Colours of a path from start to end; all are visible on white, and distinct when printed."""
+WIDTH, HEIGHT, HEIGHT_OF_PANEL, DOTS_PER_INCH = 5.2, 4.5, 2.9, 180
+"""Width of the figure of a run, its height, and that of each of several panels, in inches. TensorBoard shows
+a figure about 350 pixels wide, so that the text of a larger one would be tiny."""
+TITLE_LETTERS = 46
+"""Maximum number of letters in a line of such a figure's title."""
 MAX_TIME_LABELS = 7
 """Largest number of times that are written along a path."""
 
@@ -32,6 +38,30 @@ def new_figure(width: float, height: float, **panels: Any) -> tuple["Figure", An
     return figure, figure.subplots(**panels)
 
 
+def new_run_figure(title: str, panels: int = 1) -> tuple["Figure", list["Axes"]]:
+    """Creates an empty figure whose text can be read in a file and in TensorBoard, and its axes.
+
+    Args:
+        title: above the first panel, broken into lines.
+        panels: number of panels, one above the other, with a common horizontal axis.
+    """
+    height = max(HEIGHT, HEIGHT_OF_PANEL * panels)
+    figure, grid = new_figure(WIDTH, height, nrows=panels, sharex=True, squeeze=False)
+    figure.set_dpi(DOTS_PER_INCH)
+    axes = grid[:, 0].tolist()
+    axes[0].set_title(fill(title, TITLE_LETTERS), fontsize="medium")
+    return figure, axes
+
+
+def draw_pixels(figure: "Figure") -> npt.NDArray[np.uint8]:
+    """The pixels of a figure, (height, width, 3)."""
+    from matplotlib.backends.backend_agg import FigureCanvasAgg
+
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    return np.asarray(canvas.buffer_rgba())[..., :3]
+
+
 def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figure":
     """Estimated and true trajectory seen from above (paper fig. 4).
 
@@ -40,19 +70,19 @@ def trajectory_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "F
         truth, estimate: laser poses (N, 4, 4) in metres. Each trajectory is drawn in the frame of its own
             first pose.
     """
-    figure, axes = new_figure(7, 6)
+    figure, (axes,) = new_run_figure(title)
     # The robot drives up the page, and left turns go to the left.
     places = ((np.linalg.inv(poses[0]) @ poses)[:, :2, 3] @ ((0, 1), (-1, 0)) for poses in (truth, estimate))
-    draw_trajectory(axes, title, *places)
+    draw_trajectory(axes, *places)
     return figure
 
 
-def draw_trajectory(axes: "Axes", title: str, truth: FloatArray, estimate: FloatArray) -> None:
+def draw_trajectory(axes: "Axes", truth: FloatArray, estimate: FloatArray) -> None:
     """Draws the estimated and the true trajectory, (N, 2) metres to the right and ahead of the start."""
     for path, colour, label in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
         axes.plot(*path.T, color=colour, label=label, linewidth=1.5)
     axes.plot(0, 0, "k^", label="start")
-    axes.set(title=title, xlabel="right of the start (m)", ylabel="ahead of the start (m)")
+    axes.set(xlabel="right of the start (m)", ylabel="ahead of the start (m)")
     axes.set_aspect("equal", adjustable="datalim")
     axes.grid(alpha=0.3)
     axes.legend(fontsize="small")
@@ -65,8 +95,7 @@ def motion_figure(title: str, truth: FloatArray, estimate: FloatArray) -> "Figur
         title: above the axes.
         truth, estimate: motions (N, 2), distance in metres and heading change in radians.
     """
-    figure, panels = new_figure(11, 6, nrows=2, sharex=True)
-    figure.suptitle(title)
+    figure, panels = new_run_figure(title, panels=2)
     labels = ("heading change (degrees)", "distance (m)")
     for axes, column, label in zip(panels, (1, 0), labels, strict=True):
         for motions, colour, name in ((truth, TRUTH, "ground truth"), (estimate, ESTIMATE, "estimate")):
@@ -91,7 +120,7 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
     """
     from scipy.stats import halfnorm
 
-    figure, axes = new_figure(7, 5)
+    figure, (axes,) = new_run_figure(title)
     times = np.linspace(0, 4, 200)
     axes.plot(times, 100 * halfnorm.cdf(times), "k--", label="normal errors", linewidth=1)
     for column, colour, label in ((0, TRUTH, "distance"), (1, ESTIMATE, "heading")):
@@ -103,7 +132,6 @@ def coverage_figure(title: str, ratios: FloatArray) -> "Figure":
         xlabel="size of the error, in estimated standard deviations",
         ylabel="scans with an error up to that size (%)",
     )
-    axes.set_title(title, fontsize="medium")
     axes.grid(alpha=0.3)
     axes.legend()
     return figure

@@ -7,8 +7,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
+import numpy.typing as npt
 
-from rcnn_odom.evaluation.figures import coverage_figure, motion_figure, trajectory_figure
+from rcnn_odom.evaluation.figures import coverage_figure, draw_pixels, motion_figure, trajectory_figure
 from rcnn_odom.evaluation.metrics import Report
 from rcnn_odom.evaluation.run_folder import Settings
 from rcnn_odom.evaluation.scores import (
@@ -46,7 +47,7 @@ def report_drives(
     drives: list[Drive],
     data: Settings,
     folder: Path,
-    add_figure: Callable[[str, "Figure"], None] | None = None,
+    add_figure: Callable[[str, npt.NDArray[np.uint8]], None] | None = None,
 ) -> Report:
     """Scores the estimates of a model and of the baselines; writes trajectories and figures.
 
@@ -59,7 +60,7 @@ def report_drives(
         drives: drives with ground truth.
         data: the options of ``conf/data``.
         folder: folder in which ``trajectories`` and ``figures`` are written.
-        add_figure: also called with the name of each figure and the figure.
+        add_figure: also called with the name of each figure and its pixels, (height, width, 3).
 
     Returns:
         ``test`` (see :func:`rcnn_odom.evaluation.scores.score_all`); ``baselines``, the same by the name of
@@ -168,14 +169,17 @@ def write_drive(drive: Drive, steps: Steps, baselines: Mapping[str, FloatArray],
 def _save_figures(
     figures: Iterable[tuple[str, "Figure"]],
     folder: Path,
-    add_figure: Callable[[str, "Figure"], None] | None,
+    add_figure: Callable[[str, npt.NDArray[np.uint8]], None] | None,
 ) -> None:
-    """Saves each figure under its name as a PNG file, and passes it to ``add_figure``."""
+    """Saves each figure under its name as a PNG file, and passes its pixels to ``add_figure``."""
+    from matplotlib.image import imsave
+
     folder.mkdir(parents=True, exist_ok=True)
     for name, figure in figures:
-        figure.savefig(folder / f"{name}.png", dpi=120)
+        pixels = draw_pixels(figure)
+        imsave(folder / f"{name}.png", pixels)
         if add_figure:
-            add_figure(f"test/{name}", figure)
+            add_figure(f"test/{name}", pixels)
 
 
 def _figures(

@@ -1,16 +1,17 @@
 """What TensorBoard shows of a run: names of curves and figures, text cards, charts, the row in HParams."""
 
 import re
-from textwrap import fill
 from typing import TYPE_CHECKING, Any, cast
 
 import lightning as L
+import numpy as np
+import numpy.typing as npt
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torch.utils.tensorboard.summary import hparams, text
 
-from rcnn_odom.evaluation.figures import new_figure
+from rcnn_odom.evaluation.figures import draw_pixels, new_run_figure
 from rcnn_odom.evaluation.metrics import DRIFT, Report, all_metrics
 from rcnn_odom.evaluation.run_folder import Settings, flat
 from rcnn_odom.training.modules import OdometryModule
@@ -54,11 +55,6 @@ WITH_DRIVES = "drift", "r_err_deg_per_m"
 
 FIGURE_TITLES = {"trajectory": "estimated and true path", "motion": "rotation and translation of each frame"}
 """Content of the figures of a single drive, by the end of the file's name."""
-WIDTH, HEIGHT, HEIGHT_OF_PANEL, DOTS_PER_INCH = 5.2, 4.5, 2.9, 180
-"""Width of a figure, its least height, and that of each of several panels, in inches. TensorBoard shows a
-figure about 350 pixels wide, so that the text of a larger one would be tiny."""
-TITLE_LETTERS = 46
-"""Maximum number of letters in a line of a figure's title."""
 
 NOT_IN_ROW = (
     "run_dir",
@@ -220,28 +216,16 @@ def figure_tag(name: str) -> str:
     return f"{FIGURES}{ALL_DRIVES}: {known.get(name, name.replace('_', ' '))}"
 
 
-def log_figure(logger: TensorBoardLogger, step: int, name: str, figure: "Figure") -> None:
-    """Writes a figure, in a size at which its text is readable in TensorBoard.
+def log_figure(logger: TensorBoardLogger, step: int, name: str, pixels: npt.NDArray[np.uint8]) -> None:
+    """Writes a figure.
 
     Args:
         logger: logger of the run.
         step: number of training steps.
         name: name of the figure's file.
-        figure: the figure; it is changed.
+        pixels: (height, width, 3) of the figure.
     """
-    fit_figure(figure)
-    logger.experiment.add_figure(figure_tag(name), figure, step)
-
-
-def fit_figure(figure: "Figure") -> None:
-    """Changes the size of a figure and breaks its titles into lines, for TensorBoard."""
-    width, height = figure.get_size_inches()
-    figure.set_size_inches(WIDTH, max(HEIGHT, HEIGHT_OF_PANEL * len(figure.axes), WIDTH * height / width))
-    figure.set_dpi(DOTS_PER_INCH)
-    if title := figure.get_suptitle():
-        figure.suptitle(fill(title, TITLE_LETTERS))
-    for axes in figure.axes:
-        axes.set_title(fill(axes.get_title(), TITLE_LETTERS), fontsize="medium")
+    logger.experiment.add_image(figure_tag(name), pixels, step, dataformats="HWC")
 
 
 def length_figure(name: str, test: Report) -> "Figure":
@@ -251,7 +235,7 @@ def length_figure(name: str, test: Report) -> "Figure":
         name: name of the model.
         test: the entry ``test`` of ``metrics.json``.
     """
-    figure, axes = new_figure(WIDTH, HEIGHT)
+    figure, (axes,) = new_run_figure(f"{name}: test drift by length")
     lengths = segment_lengths(test)
     for drive, scores in test["sequences"].items():
         parts = scores["drift"]["per_length"]
@@ -262,7 +246,7 @@ def length_figure(name: str, test: Report) -> "Figure":
             marker="o",
             label=f"drive {drive}",
         )
-    axes.set(title=f"{name}: test drift by length", xlabel="length of the segments (m)", ylabel="drift (%)")
+    axes.set(xlabel="length of the segments (m)", ylabel="drift (%)")
     axes.set_ylim(bottom=0)
     axes.grid(alpha=0.3)
     axes.legend()
@@ -280,7 +264,8 @@ def log_results(logger: TensorBoardLogger, settings: Settings, metrics: Report) 
     step, test = metrics["training"]["steps"], metrics["test"]
     log_text(logger, RESULTS_CARD, describe_results(settings, metrics), step)
     if segment_lengths(test):
-        log_figure(logger, step, "test_drift_by_length", length_figure(metrics["variant"], test))
+        figure = length_figure(metrics["variant"], test)
+        log_figure(logger, step, "test_drift_by_length", draw_pixels(figure))
 
 
 def log_run(logger: TensorBoardLogger, settings: Settings, metrics: Report) -> None:

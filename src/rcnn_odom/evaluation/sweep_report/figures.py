@@ -184,7 +184,8 @@ def trajectories_figure(title: str, panels: Mapping[str, tuple[FloatArray, Float
     figure, axes = new_figure(max(4.6 * len(panels), 7), 4.6, ncols=len(panels), squeeze=False)
     figure.suptitle(_escape_math(title), fontweight="bold")
     for panel, (name, pair) in zip(axes[0], panels.items(), strict=True):
-        draw_trajectory(panel, _escape_math(name), *pair)
+        draw_trajectory(panel, *pair)
+        panel.set_title(_escape_math(name))
     return figure
 
 
