@@ -13,8 +13,8 @@ install: .venv/installed
 train: install
 	$(BIN)/python train.py model=cnn_warp
 
-# One thread for each of two processes.
-PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2
+# One thread for each of two processes. The tests of a file share what they prepare, and stay in one process.
+PYTEST := OMP_NUM_THREADS=1 $(BIN)/pytest --numprocesses 2 --dist loadfile --no-loadscope-reorder
 
 test: install
 	$(PYTEST) -m "not slow"

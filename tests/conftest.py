@@ -48,6 +48,12 @@ SMALL_RECURRENT = [
 LENGTHS = "data.lengths=[10.0,20.0]"
 
 
+def pytest_collection_modifyitems(items):
+    """Files with slow tests come first, so that at the end no process is alone with a long one."""
+    slow = {item.path for item in items if item.get_closest_marker("slow")}
+    items.sort(key=lambda item: item.path not in slow)
+
+
 @pytest.fixture(scope="session")
 def kitti(tmp_path_factory):
     """Options for three tiny drives in KITTI's layout."""

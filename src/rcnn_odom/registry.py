@@ -71,7 +71,12 @@ def collect(
 
 
 def entries_of(group: str) -> Iterable[EntryPoint]:
-    """The entry points of a group, of all installed packages."""
+    """The entry points of a group, of all installed packages.
+
+    Example:
+        >>> [entry.name for entry in entries_of("console_scripts") if entry.name == "rcnn-odom"]
+        ['rcnn-odom']
+    """
     return _read_entries(group, tuple((folder, _changed(Path(folder))) for folder in sys.path))
 
 
