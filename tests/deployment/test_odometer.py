@@ -375,7 +375,7 @@ def test_a_scan_of_another_laser_is_not_used(recorder, other, says):
         assert length(pose) == pytest.approx(0.5), "the last motion goes on"
         assert len(odometer.returns()) == 0
     assert odometer.beam_check.in_a_row == len(poses)
-    assert odometer.beam_check.is_for_good
+    assert odometer.beam_check.is_another_laser
     assert len(recorder.pairs) == 4
 
 

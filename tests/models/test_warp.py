@@ -28,7 +28,7 @@ from rcnn_odom.models.cnn_warp import (
     log_determinant,
 )
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.pairs import PairTracker, as_used
+from rcnn_odom.models.pairs import PairTracker, wrap_for_stream
 from rcnn_odom.models.rcnn_warp import RCNNWarp
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Description, Warping
@@ -356,7 +356,7 @@ def test_covariances_are_those_of_two_poses_and_what_comes_back(perfect):
 def test_what_is_used_once_is_not_wrapped_again():
     network = CNNWarp(OPTIONS, SENSOR)
     stepper = network.stepper()
-    assert as_used(stepper) is stepper
+    assert wrap_for_stream(stepper) is stepper
     assert PairTracker(stepper).description.sensor == SENSOR
 
 
@@ -444,7 +444,7 @@ def test_the_only_position_looks_at_the_whole_scan():
     head = LocalConstraints(4, np.array([3.0]), Sensor(resolution_deg=45.0), 0.05)
     pairs = torch.full((1, 2, 9), 4.0)
     pairs[:, 0, 5:] = 0
-    ranges, share = head.look_around(pairs)
+    ranges, share = head.find_ranges_and_shares(pairs)
     assert ranges.tolist() == [[[4.0]]]
     assert 0.4 < share.item() < 0.9
 

@@ -150,13 +150,13 @@ def test_several_scans_are_judged_and_again_when_they_change():
     check = BeamCheck(HALF)
     for each in (half, none, half, Scan(np.zeros(0), np.zeros(0)), half):
         check(each)
-    assert (check.fitting, check.in_a_row, check.is_for_good) == (0, 3, False)
+    assert (check.fitting, check.in_a_row, check.is_another_laser) == (0, 3, False)
     assert check(good) == ""
     assert (check.fitting, check.in_a_row) == (1, 0)
     for number in range(PATIENCE):
-        assert not check.is_for_good
+        assert not check.is_another_laser
         assert "from -90 to 0 degrees" in check(half), number
-    assert check.is_for_good
+    assert check.is_another_laser
     assert check(good) == ""
     assert check(scan(even(-90, 1, 181) + 0.5, frame_id="rear"))
 

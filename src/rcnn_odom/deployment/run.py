@@ -203,7 +203,7 @@ class Statistics:
         pose = odometer.step(scan if self.stream.has_clock else replace(scan, stamp=None))
         milliseconds = 1e3 * (time.perf_counter() - start)
         self.scans += 1
-        if check and check.is_for_good:
+        if check and check.is_another_laser:
             raise check.refusal(f"{self.stream.name}: scan {self.scans}", ANOTHER_MODEL)
         if warning := self._view.add(scan):
             log.warning("%s: %s", self.stream.name, warning)

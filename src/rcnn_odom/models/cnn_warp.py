@@ -182,7 +182,7 @@ class LocalConstraints(nn.Module):
         with torch.autocast(features.device.type, enabled=False):
             constraint = self.constraint(features.float()).squeeze(-2)  # (N, 4, places)
             radial, tangential, residual, log_weight = constraint.split(1, 1)
-            ranges, share = self.look_around(pairs)
+            ranges, share = self.find_ranges_and_shares(pairs)
             weight = log_weight.clamp(*LOG_WEIGHT_BOUNDS).exp() * share
             rows = torch.cat(
                 [
@@ -199,7 +199,7 @@ class LocalConstraints(nn.Module):
             motion = invert(matrix) @ (weighted @ residual.transpose(1, 2))
             return motion.squeeze(-1), matrix
 
-    def look_around(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
+    def find_ranges_and_shares(self, pairs: Tensor) -> tuple[Tensor, Tensor]:
         """What pairs of scans (N, 2, bins) have around each position.
 
         Returns:

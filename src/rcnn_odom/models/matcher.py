@@ -24,7 +24,7 @@ from rcnn_odom.matching.outline import Outline, outline
 from rcnn_odom.matching.points import find_points
 from rcnn_odom.matching.registration import FEWEST_POINTS, Match, Registration
 from rcnn_odom.models.contract import Model
-from rcnn_odom.models.prior import LastMotion, Prior, PriorSource, Wheels, believed
+from rcnn_odom.models.prior import LastMotion, Prior, PriorSource, Wheels, guess_covariance
 from rcnn_odom.models.streaming import Registered
 from rcnn_odom.models.tracking import estimate_by_tracking
 from rcnn_odom.recordings.recording import Drive, wants_deskew
@@ -226,7 +226,7 @@ class MatcherTracker:
         if longer := elapsed - repeats:  # in the rest of the time the motion may have continued or not
             x, y, heading = self._motion.tolist()
             distance, turn = distance + longer * math.hypot(x, y), turn + longer * abs(heading)
-        return Prior(guess, self._inflate(believed(guess, distance, turn, GUESS_PART)))
+        return Prior(guess, self._inflate(guess_covariance(guess, distance, turn, GUESS_PART)))
 
     def _inflate(self, spread: FloatArray) -> FloatArray:
         """The covariance (3, 3) of the last motion, larger along directions held for several steps.

@@ -25,7 +25,7 @@ OTHER_LASER = "other laser"
 """Kind of fault, with which the note begins."""
 
 
-def as_used(network: Stepper) -> Stepper:
+def wrap_for_stream(network: Stepper) -> Stepper:
     """The stepper of a network in a stream: for residual motions a ``WarpingStepper``, else the network."""
     return _find_warping_stepper(network) or network
 

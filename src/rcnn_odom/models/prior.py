@@ -74,7 +74,7 @@ class PriorSource(Protocol):
         """
 
 
-def believed(step: FloatArray, distance: float, turn: float, part: float) -> FloatArray:
+def guess_covariance(step: FloatArray, distance: float, turn: float, part: float) -> FloatArray:
     """The covariance (3, 3) of a guessed step, from the assumed size of its errors.
 
     Args:
@@ -83,7 +83,8 @@ def believed(step: FloatArray, distance: float, turn: float, part: float) -> Flo
         part: fraction of the step's length and turn that is added to them.
 
     Example:
-        >>> believed(np.array([1.0, 0.0, 0.0]), distance=0.1, turn=0.1, part=0.4).diagonal().round(4).tolist()
+        >>> step = np.array([1.0, 0.0, 0.0])
+        >>> guess_covariance(step, distance=0.1, turn=0.1, part=0.4).diagonal().round(4).tolist()
         [0.25, 0.25, 0.01]
     """
     x, y, heading = step.tolist()
@@ -158,7 +159,7 @@ class Wheels:
         if before is None or scan.wheel_pose is None:
             return last_motion, ()
         step = relative_step(np.array(before), np.array(scan.wheel_pose))
-        spread = believed(step, WHEELS_DISTANCE, WHEELS_TURN, SLIP)
+        spread = guess_covariance(step, WHEELS_DISTANCE, WHEELS_TURN, SLIP)
         return Prior(step, spread, spread, WHEELS_STEP), ()
 
     def compare(self, step: FloatArray, is_determined: bool) -> None:

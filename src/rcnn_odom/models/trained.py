@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from rcnn_odom.geometry import FloatArray, Step, Steps
 from rcnn_odom.models.contract import Description, Model, Stepper
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.pairs import as_used
+from rcnn_odom.models.pairs import wrap_for_stream
 from rcnn_odom.options import option
 from rcnn_odom.recordings.recording import Drive
 
@@ -195,7 +195,7 @@ class TrainedModel(nn.Module, Model):
 
     def stepper(self) -> Stepper:
         """The network in a stream, computed by PyTorch; robots use the exported file, which is faster."""
-        return as_used(TorchStepper(self))
+        return wrap_for_stream(TorchStepper(self))
 
 
 class TorchStepper:

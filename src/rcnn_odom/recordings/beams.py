@@ -192,7 +192,7 @@ class BeamCheck:
         self._beam_reason, self._frame = "", ""
 
     @property
-    def is_for_good(self) -> bool:
+    def is_another_laser(self) -> bool:
         """Whether ``PATIENCE`` scans in a row did not fit, so that the laser must be another one."""
         return self.in_a_row >= PATIENCE
 

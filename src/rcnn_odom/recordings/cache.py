@@ -79,7 +79,7 @@ class Encoding:
             scan = recording.read_scan(frame)
             if not check(scan):
                 depth[:] = self.encoder.encode(scan)
-            elif check.is_for_good:
+            elif check.is_another_laser:
                 raise check.refusal(f"{name}: frame {frame}", FITTING_SENSOR)
         # The last piece of a long recording may have too few frames for a verdict.
         if check.misfitting > check.fitting and (start == 0 or stop - start > beams.PATIENCE):

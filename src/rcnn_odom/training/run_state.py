@@ -100,7 +100,7 @@ class Fingerprints(NamedTuple):
 
 
 class Found(NamedTuple):
-    """The state of a run, and the folder with its weights; for a twin, the folder of the other run."""
+    """The state of a run, and the folder of its weights, or of a finished run with the same settings."""
 
     state: State
     run: Path
