@@ -47,7 +47,7 @@ def build(variant="rcnn_reg", projection=None, sensor=SENSOR, fitted=True, seed=
     if variant.startswith("rcnn"):
         changes["projection"] = projection
     model = find_model(variant)(options(variant, **changes), sensor)
-    model.set_units(steps_of(motions_like(MEAN, DEVIATION), "middle"))
+    model.set_units([steps_of(motions_like(MEAN, DEVIATION), "middle")])
     if fitted:
         width = model.uncertainty.weights.shape[1]
         model.uncertainty.weights.copy_(0.01 * torch.arange(1, 2 * width + 1).reshape(2, width))

@@ -234,9 +234,9 @@ def compound_covariance(pose: FloatArray, covariance: FloatArray, step: Step) ->
 
 def _compound(heading: float, covariance: FloatArray, step: Step, step_covariance: FloatArray) -> FloatArray:
     """The covariance (3, 3) after a step from a pose with this heading and this covariance (3, 3)."""
-    turn = _rotation(heading)
+    turn = rotation_matrix(heading)
     x, y = turn[0, 0] * step.x + turn[0, 1] * step.y, turn[1, 0] * step.x + turn[1, 1] * step.y
-    return _propagate(_heading_jacobian(x, y), covariance) + _propagate(turn, step_covariance)
+    return _propagate(lever_matrix(x, y), covariance) + _propagate(turn, step_covariance)
 
 
 class AccumulatedCovariance:
@@ -269,21 +269,31 @@ class AccumulatedCovariance:
             return  # the zero step of a scan that was not used
         lasting = step.covariance
         if self._taken_back.any() or step.taken_back.any():
-            before = _propagate(_heading_jacobian(step.x, step.y), self._taken_back)
-            after = _propagate(_rotation(step.heading), step.taken_back)
+            before = _propagate(lever_matrix(step.x, step.y), self._taken_back)
+            after = _propagate(rotation_matrix(step.heading), step.taken_back)
             lasting = _nearest_covariance(lasting - before - after)
         self._taken_back = step.taken_back
         self._lasting = _compound(pose[2], self._lasting, step, lasting)
-        self.value = self._lasting + _propagate(_rotation(pose[2] + step.heading), self._taken_back)
+        self.value = self._lasting + _propagate(rotation_matrix(pose[2] + step.heading), self._taken_back)
 
 
-def _heading_jacobian(x: float, y: float) -> FloatArray:
-    """The Jacobian (3, 3) of a pose x and y metres away with respect to the pose from which it is seen."""
+def lever_matrix(x: float, y: float) -> FloatArray:
+    """The Jacobian (3, 3) of a pose x and y metres away with respect to the pose from which it is seen.
+
+    Example:
+        >>> lever_matrix(2.0, 0.0) @ [0.0, 0.0, 0.1]  # 2 m ahead, an error of the heading is one sideways
+        array([0. , 0.2, 0.1])
+    """
     return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])
 
 
-def _rotation(heading: float) -> FloatArray:
-    """The matrix (3, 3) that rotates x and y by a heading in radians and leaves the heading as it is."""
+def rotation_matrix(heading: float) -> FloatArray:
+    """The matrix (3, 3) that rotates x and y by a heading in radians and leaves the heading as it is.
+
+    Example:
+        >>> (rotation_matrix(math.pi / 2) @ [1.0, 0.0, 0.3]).round(3)
+        array([0. , 1. , 0.3])
+    """
     cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
@@ -351,7 +361,8 @@ def relative_covariance(step: Step, earlier: FloatArray, later: FloatArray) -> F
         >>> relative_covariance(Step(2.0, 0.0, 0.0), earlier, later).diagonal().round(6)
         array([0.  , 0.04, 0.01])
     """
-    return _propagate(_heading_jacobian(step.x, step.y), earlier) + _propagate(_rotation(step.heading), later)
+    turned = _propagate(rotation_matrix(step.heading), later)
+    return _propagate(lever_matrix(step.x, step.y), earlier) + turned
 
 
 def turn_covariance(covariance: FloatArray, heading: float) -> FloatArray:
@@ -365,7 +376,7 @@ def turn_covariance(covariance: FloatArray, heading: float) -> FloatArray:
         >>> turn_covariance(np.diag([1.0, 4.0, 0.1]), np.pi / 2).diagonal().round(6)  # x and y swap
         array([4. , 1. , 0.1])
     """
-    return _propagate(_rotation(heading), covariance)
+    return _propagate(rotation_matrix(heading), covariance)
 
 
 def covariance_ellipse(covariance: FloatArray, deviations: float) -> tuple[FloatArray, float] | None:

@@ -28,7 +28,8 @@ from rcnn_odom.models.cnn_warp import (
     log_determinant,
 )
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.pairs import PairTracker, wrap_for_stream
+from rcnn_odom.models.motion_filter import MotionFilter
+from rcnn_odom.models.pairs import PairTracker, estimate_encoded, wrap_for_stream
 from rcnn_odom.models.rcnn_warp import RCNNWarp
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Description, Warping
@@ -228,6 +229,36 @@ def test_a_network_that_jumps_about_has_no_step():
     scans, steps = drive()
     network = Jumping(scans, steps, Warping(0.5, 4, 0.1, 0.05, 0.3, 20.0))
     assert np.isnan(WarpingStepper(network)(scans[:2]).array()).all()
+
+
+@pytest.mark.parametrize("passes", [5, 6, 7])
+def test_after_a_sudden_stop_the_first_step_is_right(spied, passes):
+    """The motion was known to a centimetre and is another one; the number of comparisons changes nothing."""
+    poses = [(-3.5 + 1.2 * min(n, 5), 0.0, 0.0) for n in range(9)]
+    steps = np.diff(np.array(poses), axis=0)
+    scans = np.stack([room_scan(pose) for pose in poses])
+    network = Perfect(scans, steps, Warping(0.5, passes, 0.1, 0.05, 100.0, 20.0), np.diag([1e-4, 1e-4, 1e-6]))
+    network.description = replace(
+        network.description, typical_step=(1.2, 0.1, 0.02), typical_change=(0.01, 0.01, 0.001)
+    )
+    found = estimate_encoded(spied(network), scans)
+    assert np.allclose(found.values, steps, atol=1e-2)
+
+
+def test_after_scans_that_were_not_used_the_motion_is_uncertain(spied):
+    """Before a wall that tells nothing, the deviation says that the motion may have changed meanwhile."""
+    scans, steps = drive(12)
+    network = Perfect(scans, steps, Warping(0.5, 3, 0.1, 0.05, 100.0, 20.0))
+    network.description = replace(
+        network.description, typical_step=(1.0, 0.1, 0.02), typical_change=(0.01, 0.01, 0.001)
+    )
+    stepper = spied(network)
+    for number in range(5):
+        stepper(scans[number : number + 2])
+    network.covariance, place = np.diag([25.0, 1e-4, 1e-6]), stepper(scans[5:7])
+    assert place.covariance[0, 0] < 1e-3
+    after = stepper(scans[[8, 9]])
+    assert after.covariance[0, 0] > 3.0
 
 
 def track(network, scans, stamps):
@@ -449,6 +480,23 @@ def test_the_only_position_looks_at_the_whole_scan():
     assert 0.4 < share.item() < 0.9
 
 
+def test_the_first_position_of_a_circle_looks_across_the_seam():
+    """At four of 20 bins on either side of bin 0; bin 20 is the same as bin 0."""
+    head = LocalConstraints(4, np.array([0.0, 8.0]), Sensor(resolution_deg=18.0), 0.05)
+    pairs = torch.zeros(1, 2, 21)
+    pairs[..., :5], pairs[..., 16:] = 3.0, 5.0
+    ranges, share = head.find_ranges_and_shares(pairs)
+    assert 3.5 < ranges[0, 0, 0] < 4.5
+    assert share[0, 0, 0] == 1
+
+
+def test_the_change_of_the_motion_is_that_within_drives():
+    """Two drives at speeds of their own, in which nothing changes."""
+    model = CNNWarp(OPTIONS, SENSOR)
+    model.set_units([np.tile([speed, 0.0, 0.0], (20, 1)) for speed in (0.2, 1.5)])
+    assert model.describe().typical_change == (0, 0, 0)
+
+
 def rotation(heading):
     cos, sin = math.cos(heading), math.sin(heading)
     return np.array([[cos, -sin], [sin, cos]])
@@ -593,35 +641,67 @@ def test_another_first_stage_is_refused():
         network.take_first_stage(CNNWarp(OPTIONS | {"kernel_size": 5}, SENSOR))
 
 
-def test_a_drive_goes_on_where_the_place_is_not_known(monkeypatch):
-    """As in a stream: the last motion, of which nobody knows how wrong it is."""
-    network = CNNWarp(OPTIONS, SENSOR)
-    told = [Step(1.0, 0.0, 0.1, np.eye(3)), Step(*[math.nan] * 3), Step(2.0, 0.0, 0.0, np.eye(3))]
-
-    class Told:
-        description = network.describe()
-
-        def __call__(self, pair):
-            return told.pop(0)
-
-    monkeypatch.setattr(network, "stepper", Told)
-    steps = network.estimate_scans(torch.zeros(4, SENSOR.bins))
-    assert steps.values[:, 0].tolist() == [1.0, 1.0, 2.0]
-    assert np.isnan(steps.covariances[1]).all()
+@pytest.mark.parametrize("empty", [(), (0, 1, 2), (12, 13, 20), tuple(range(8, 20))])
+def test_a_drive_is_estimated_as_in_a_stream(perfect, empty):
+    """Over scans without returns, at its beginning as well, and where the network fails."""
+    scans, steps = drive(30)
+    stepper = perfect(scans, steps)
+    stepper.network.poses[5] = stepper.network.poses[25] = np.full(3, np.nan)
+    scans = scans.copy()
+    scans[list(empty)] = 0.0
+    streamed = [each.step for each in track(stepper, scans, 0.1 * np.arange(30))][1:]
+    stepper.reset()
+    found = estimate_encoded(stepper, scans)
+    assert np.allclose(found.values, [step.array() for step in streamed])
+    if 0 not in empty:  # before the first returns, a stream takes the pose for certain
+        assert np.allclose(found.covariances, [step.covariance for step in streamed], equal_nan=True)
 
 
 def test_calibration_scales_the_deviations_and_keeps_no_period(monkeypatch):
     rng = np.random.default_rng(0)
     true = np.array([0.02, 0.01, 0.003])
     scans, steps = np.ones((501, SENSOR.bins), np.float32), rng.normal(0, 0.1, (500, 3))
-    told = Steps(
-        steps + true * rng.standard_normal((500, 3)), np.tile(np.diag([1e-4, 1e-4, 1e-4]), (500, 1, 1))
-    )
+    told = steps + true * rng.standard_normal((500, 3))
     network = CNNWarp(OPTIONS, SENSOR)
-    monkeypatch.setattr(network, "estimate", lambda _: told)
+
+    def estimate(drive):
+        return Steps(told, np.tile(np.diag(np.square(0.01 * network.scale.double().numpy())), (500, 1, 1)))
+
+    monkeypatch.setattr(network, "estimate", estimate)
     network.calibrate([Drive("a", "k", scans, compose(steps), np.arange(501.0), FORWARD_CAMERA)])
     assert network.scale.numpy() == pytest.approx(true / 0.01, rel=0.1)
     assert math.isnan(network.describe().period)
+
+
+@pytest.mark.parametrize("claimed", [0.2, 0.05, 0.0125])
+def test_calibration_holds_for_the_steps_that_it_leads_to(spied, monkeypatch, claimed):
+    """The filter follows measurements of a smaller deviation more closely: one factor is not enough."""
+    rng = np.random.default_rng(3)
+    change, noise, count = np.array([0.03, 0.01, 0.003]), np.array([0.05, 0.02, 0.005]), 600
+    steps = np.cumsum(change * rng.standard_normal((count, 3)), 0) * [1, 1, 0.1]
+    drive_of = Drive(
+        "a", "k", np.ones((count + 1, 2), np.float32), compose(steps), np.arange(601.0), FORWARD_CAMERA
+    )
+    network = CNNWarp(OPTIONS, SENSOR)
+
+    def estimate(_):
+        motion_filter, values, covariances = MotionFilter(change, np.ones(3)), [], []
+        draws = np.random.default_rng(4)
+        for step in steps:
+            expected = motion_filter.displacement()
+            residual = relative_step(expected, step) + noise * draws.standard_normal(3)
+            stated = np.diag(np.square(claimed / 0.05 * noise * network.scale.double().numpy()))
+            weighed = motion_filter.weigh(residual, stated)
+            covariances.append(motion_filter.correct(weighed)[0])
+            values.append(advance(expected, weighed.correction))
+            motion_filter.take_key()
+        return Steps(np.array(values), np.array(covariances))
+
+    monkeypatch.setattr(network, "estimate", estimate)
+    network.calibrate([drive_of])
+    found = estimate(drive_of)
+    ratios = np.abs(found.values - drive_of.steps) / np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
+    assert (ratios < 1).mean(0) == pytest.approx(0.6827, abs=0.05)
 
 
 def test_pairs_that_do_not_share_their_scans_are_refused():

@@ -463,7 +463,7 @@ def test_turn_is_asked_for_in_degrees(cache):
 
 def test_training_steps_are_those_of_the_training_drives(cache):
     module = room_module(cache, train=("short", "long[:0.25]")).load()
-    steps = module.training_steps()
+    steps = np.concatenate(module.training_steps())
     drives = random_planar(5, seed=5), random_planar(40, seed=40)[:10]
     befores, afters = (
         np.concatenate([planar[part] for planar in drives]) for part in (slice(-1), slice(1, None))

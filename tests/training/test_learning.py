@@ -58,7 +58,7 @@ def test_a_small_network_learns_to_measure_motion():
     )
     trainer.fit(module, datamodule=data)
     new = [make_drive(seed) for seed in (200, 201, 202)]
-    mean = data.training_steps().mean(axis=0)
+    mean = np.concatenate(data.training_steps()).mean(axis=0)
     constant = drift_of(new, lambda each: Steps.with_unknown_covariance(np.tile(mean, (len(each) - 1, 1))))
     learnt = drift_of(new, lambda each: module.model.estimate_scans(torch.from_numpy(each.scans)))
     assert learnt < DRIFT

@@ -34,7 +34,7 @@ NAMED = [
 def build(variant, seed=0, sensor=SENSOR, **changes):
     torch.manual_seed(seed)
     module = module_for(variant)(options(variant, **changes), sensor.as_dict(), LENGTHS)
-    module.set_units(steps_of(motions_like(MEAN, DEVIATION), "middle"))
+    module.set_units([steps_of(motions_like(MEAN, DEVIATION), "middle")])
     return module
 
 
@@ -155,7 +155,7 @@ def test_every_epoch_draws_other_windows(monkeypatch):
 @pytest.mark.parametrize("freeze", [False, True])
 def test_first_stage_is_taken_over_and_frozen_if_asked_for(freeze):
     cnn, module = build("cnn_cls", seed=5), build("rcnn_reg", seed=6, freeze=freeze)
-    cnn.set_units(steps_of(motions_like(MEAN + 1, DEVIATION * 2), "middle"))
+    cnn.set_units([steps_of(motions_like(MEAN + 1, DEVIATION * 2), "middle")])
     module.model.take_first_stage(cnn.model)
     scans = random_scans(9)
     pairs = torch.stack([scans[:-1], scans[1:]], 1)[None]
@@ -169,7 +169,7 @@ def test_first_stage_is_taken_over_and_frozen_if_asked_for(freeze):
 
 def test_units_of_training_drives_with_one_step_alone_are_not_zero():
     module = build("rcnn_reg")
-    module.set_units(np.tile([1.0, 0.2, 0.0], (4, 1)))
+    module.set_units([np.tile([1.0, 0.2, 0.0], (4, 1))])
     np.testing.assert_allclose(module.mean_step, [1.0, 0.2, 0.0], rtol=1e-6)
     for head in (module.model.head, module.model.cnn.head):
         assert (head.deviation > 0).all()

@@ -309,10 +309,10 @@ class TwoNumberModel(TrainedModel):
         diverged = ~estimate.motion.isfinite().flatten(1).all(1)
         return {"loss": loss.total, **parts, **outside, "diverged": diverged}
 
-    def set_units(self, steps: FloatArray) -> None:
+    def set_units(self, steps: Sequence[FloatArray]) -> None:
         """Also sets the mean and the standard deviation of the training motions in all heads."""
         super().set_units(steps)
-        motions = motions_of(steps)
+        motions = motions_of(np.concatenate(steps))
         for head in (part for part in self.modules() if isinstance(part, MotionHead)):
             head.mean.copy_(torch.from_numpy(motions.mean(0)))
             head.deviation.copy_(torch.from_numpy(np.maximum(motions.std(0), 1e-6)))

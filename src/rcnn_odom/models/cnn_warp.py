@@ -32,7 +32,7 @@ from rcnn_odom.geometry import (
 )
 from rcnn_odom.models.cnn import Encoder
 from rcnn_odom.models.encoding import Sensor
-from rcnn_odom.models.pairs import estimate_pairs
+from rcnn_odom.models.pairs import estimate_encoded
 from rcnn_odom.models.reprojection import DepthVector, render_many
 from rcnn_odom.models.streaming import Description, Warping
 from rcnn_odom.models.trained import Batch, Recipe, State, TrainedModel
@@ -57,6 +57,8 @@ ROUNDING = 1e-6
 """Relative rounding error of a matrix entry in fp32."""
 LIKELIHOOD_WEIGHT = 0.05
 """Weight of the likelihood in the loss; the covariances are learned from it."""
+FITS, FITTED = 6, 0.03
+"""The scale of the covariances is fitted so many times at most, until it changes by less than this."""
 REST_FRACTION = 0.1
 """Fraction of the training guesses that assume no motion, as at the beginning of a drive."""
 LARGEST_REST_DISTANCE, LARGEST_REST_TURN = 3.0, 0.35
@@ -70,8 +72,8 @@ class ResidualOptions:
     Attributes:
         x, y: standard deviations in metres, ahead and to the left.
         heading_deg: standard deviation in degrees.
-        smallest, largest: the three deviations are multiplied by a random power of ten, whose exponent lies
-            between these two numbers.
+        smallest, largest: each deviation is multiplied by a random power of ten, whose exponent lies between
+            these two numbers.
     """
 
     x: float = option(above=0)
@@ -164,7 +166,10 @@ class LocalConstraints(nn.Module):
         bearings = np.deg2rad(sensor.first_bin_deg + sensor.resolution_deg * places)
         spread = (np.arange(RANGES_A_PLACE) + 0.5) / RANGES_A_PLACE - 0.5
         width = np.diff(places).mean() if len(places) > 1 else sensor.bins
-        near = np.rint(places[:, None] + width * spread).clip(0, sensor.bins - 1)
+        near = np.rint(places[:, None] + width * spread)
+        # The last bin of a full circle is the first one again.
+        is_circle = sensor.field_of_view_deg == 360
+        near = near % (sensor.bins - 1) if is_circle else near.clip(0, sensor.bins - 1)
         self.register_buffer("cos", torch.from_numpy(np.cos(bearings)).float(), persistent=False)
         self.register_buffer("sin", torch.from_numpy(np.sin(bearings)).float(), persistent=False)
         self.register_buffer("near", torch.from_numpy(near).long(), persistent=False)
@@ -300,10 +305,11 @@ class ResidualNetwork(TrainedModel):
         self.register_buffer("typical_change", torch.full((3,), torch.nan))
         self.register_buffer("units", torch.tensor([1.0, 1.0, options["radians_a_metre"]]), persistent=False)
 
-    def set_units(self, steps: FloatArray) -> None:
-        """Also computes ``typical_change`` from the steps (N, 3) of the training drives."""
+    def set_units(self, steps: Sequence[FloatArray]) -> None:
+        """Also computes ``typical_change`` from the steps (N, 3) of each training drive."""
         super().set_units(steps)
-        self.typical_change.copy_(torch.from_numpy(np.sqrt(np.square(np.diff(steps, axis=0)).mean(0))))
+        changes = np.concatenate([np.diff(drive, axis=0) for drive in steps])
+        self.typical_change.copy_(torch.from_numpy(np.sqrt(np.square(changes).mean(0))))
 
     def take_weights(self, model: TrainedModel) -> None:
         """Also keeps ``typical_change`` of the new training drives."""
@@ -348,28 +354,35 @@ class ResidualNetwork(TrainedModel):
         """The steps of encoded scans (N, bins), as in a stream, in full precision."""
         values = scans.cpu().numpy()
         with torch.autocast(scans.device.type, enabled=False):
-            return estimate_pairs(
-                self.stepper(), (values[frame : frame + 2] for frame in range(len(values) - 1))
-            )
+            return estimate_encoded(self.stepper(), values)
 
     def calibrate(self, drives: Sequence[Drive]) -> None:
         """Also fits ``scale``, so that 68.27 % of the errors lie within one standard deviation.
+
+        Since it also changes how much of a measurement the filter believes, it is fitted again with the steps
+        that it leads to.
 
         ``period`` remains nan, because residual motions can be measured at any rate of scans.
         """
         super().calibrate(drives)
         self.period.fill_(torch.nan)
         self.scale.fill_(1.0)
-        estimates = [self.estimate(drive) for drive in drives]
-        errors = np.concatenate(
-            [each.values - drive.steps for each, drive in zip(estimates, drives, strict=True)]
-        )
-        variances = np.concatenate([np.diagonal(each.covariances, axis1=1, axis2=2) for each in estimates])
-        known = np.isfinite(errors).all(1) & np.isfinite(variances).all(1)
-        if not known.any():
-            return
-        ratios = np.abs(errors[known]) / np.sqrt(variances[known])
-        self.scale.copy_(torch.from_numpy(np.maximum(np.quantile(ratios, WITHIN_DEVIATION, axis=0), 1e-3)))
+        for _ in range(FITS):
+            estimates = [self.estimate(drive) for drive in drives]
+            errors = np.concatenate(
+                [each.values - drive.steps for each, drive in zip(estimates, drives, strict=True)]
+            )
+            variances = np.concatenate(
+                [np.diagonal(each.covariances, axis1=1, axis2=2) for each in estimates]
+            )
+            known = np.isfinite(errors).all(1) & np.isfinite(variances).all(1)
+            if not known.any():
+                return
+            ratios = np.abs(errors[known]) / np.sqrt(variances[known])
+            factor = np.maximum(np.quantile(ratios, WITHIN_DEVIATION, axis=0), 1e-3)
+            self.scale.mul_(torch.from_numpy(factor).float())
+            if np.abs(np.log(factor)).max() < FITTED:
+                return
 
     def compare_residuals(self, motion: Tensor, matrix: Tensor, truth: Tensor) -> dict[str, Tensor]:
         """The loss of estimated residual motions.
@@ -446,10 +459,10 @@ class ResidualNetwork(TrainedModel):
             return step
         options = ResidualOptions(**self.options["residual"])
         deviations = np.array([options.x, options.y, math.radians(options.heading_deg)])
-        # A common scale: with one for each, small residuals get rarer, and are measured less finely
-        # (docs/warp.md).
-        scale = 10 ** rng.uniform(options.smallest, options.largest)
-        drawn: FloatArray = deviations * rng.standard_normal(3) * scale
+        # A scale for each part: with a common one, the network infers one part from the others, for instance
+        # along a corridor that the guess is right since its heading is (docs/warp.md).
+        scales = 10 ** rng.uniform(options.smallest, options.largest, 3)
+        drawn: FloatArray = deviations * rng.standard_normal(3) * scales
         return drawn
 
 

@@ -15,6 +15,7 @@ from rcnn_odom.geometry import (
     advance,
     planar_to_poses,
     relative_step,
+    rotation_matrix,
     turn_to_middle,
 )
 from rcnn_odom.matching.deskew import deskew
@@ -188,7 +189,7 @@ class MatcherTracker:
         scan_outline = self._find_outline(scan)
         prior, prior_notes = self._source.expect(scan, periods, seconds, self._continue_motion(elapsed))
         before = self._registration.pose
-        rotation = _rotation(float(before[2]))
+        rotation = rotation_matrix(float(before[2]))
         match = self._registration.register(
             scan_outline,
             advance(before, prior.step),
@@ -236,7 +237,7 @@ class MatcherTracker:
         """
         if not self._held_in_a_row:
             return spread
-        held = _rotation(-float(self._registration.pose[2])) @ self._held_directions
+        held = rotation_matrix(-float(self._registration.pose[2])) @ self._held_directions
         along = np.einsum("ik,ij,jk->k", held, spread, held)
         return spread + (2.0 * self._held_in_a_row) * (held * along) @ held.T
 
@@ -259,12 +260,6 @@ class MatcherTracker:
         found = outline(find_points(ranges, bearings, limit))
         self._returns = found.returns
         return found
-
-
-def _rotation(heading: float) -> FloatArray:
-    """The matrix (3, 3) that rotates x and y by a heading in radians."""
-    cos, sin = math.cos(heading), math.sin(heading)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
 
 
 def _describe_lack(scan: Outline) -> str:

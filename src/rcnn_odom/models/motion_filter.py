@@ -1,11 +1,10 @@
 """A Kalman filter of pose and motion with nearly constant velocity; this module needs only numpy."""
 
-import math
 from typing import NamedTuple
 
 import numpy as np
 
-from rcnn_odom.geometry import FloatArray, advance, turn_covariance
+from rcnn_odom.geometry import FloatArray, advance, lever_matrix, rotation_matrix, turn_covariance
 
 
 class _Predicted(NamedTuple):
@@ -81,7 +80,7 @@ class MotionFilter:
     """
 
     def __init__(self, change: FloatArray, typical: FloatArray) -> None:
-        self._change, self._typical = np.diag(np.square(change)), typical
+        self._change, self._unknown_motion = np.diag(np.square(change)), np.diag(np.square(2 * typical))
         self.begin()
 
     def begin(self) -> None:
@@ -89,8 +88,14 @@ class MotionFilter:
         self.motion: FloatArray = np.zeros(3)
         # Covariance of pose and motion in the frame of the last scan.
         self._errors: FloatArray = np.zeros((6, 6))
-        self._errors[3:, 3:] = np.diag(np.square(2 * self._typical))
+        self._errors[3:, 3:] = self._unknown_motion
         self._predicted: _Predicted | None = None  # from this state; each comparison of a scan needs it
+
+    def forget_motion(self) -> None:
+        """Makes the motion as uncertain as at the beginning; its estimate remains the best guess."""
+        self._errors[3:], self._errors[:, 3:] = 0.0, 0.0
+        self._errors[3:, 3:] = self._unknown_motion
+        self._predicted = None
 
     def take_key(self) -> None:
         """Makes the last scan the key scan, so that its relative pose has no error."""
@@ -118,7 +123,7 @@ class MotionFilter:
             periods: periods from the last scan to this one.
         """
         predicted, turn = self._predict(periods), periods * float(self.motion[2])
-        pose, towards = predicted.whole_pose, _turn(turn)
+        pose, towards = predicted.whole_pose, rotation_matrix(turn)
         measured = turn_covariance(covariance, turn)  # in the frame of the scan before, like all the others
         inverse = np.linalg.inv(pose + measured).astype(np.float64, copy=False)
         gain, rotated = pose @ inverse, towards @ residual
@@ -173,11 +178,11 @@ class MotionFilter:
         if self._predicted is not None and self._predicted.periods == periods:
             return self._predicted
         motion, change = self._errors[3:, 3:], self._change
-        turns = [_turn(number * float(self.motion[2])) for number in range(periods)]
+        turns = [rotation_matrix(number * float(self.motion[2])) for number in range(periods)]
         own = [np.eye(3)]
         for turn in turns[1:]:
-            own.append(_lever(turn @ self.motion) @ own[-1] + turn)
-        lever, all_periods = _lever(self.displacement(periods)), own[-1]
+            own.append(lever_matrix(*(turn @ self.motion)[:2]) @ own[-1] + turn)
+        lever, all_periods = lever_matrix(*self.displacement(periods)[:2]), own[-1]
         changes = [turn @ own[periods - 1 - number] for number, turn in enumerate(turns)]
         both = lever @ self._errors[:3, 3:]
         self._predicted = _Predicted(
@@ -199,20 +204,8 @@ class MotionFilter:
             motion: (3, 3) of the motion, which goes with the laser and needs no other frame.
             turn: heading of the scan in the frame of the scan before.
         """
-        back = _turn(-turn)
+        back = rotation_matrix(-turn)
         self._errors[:3, :3], self._errors[:3, 3:] = back @ pose @ back.T, back @ both
         self._errors[3:, :3], self._errors[3:, 3:] = self._errors[:3, 3:].T, motion
         self._errors = (self._errors + self._errors.T) / 2
         self._predicted = None
-
-
-def _turn(heading: float) -> FloatArray:
-    """The matrix (3, 3) that rotates x and y counter-clockwise by a heading in radians."""
-    cos, sin = math.cos(heading), math.sin(heading)
-    return np.array([[cos, -sin, 0.0], [sin, cos, 0.0], [0.0, 0.0, 1.0]])
-
-
-def _lever(displacement: FloatArray) -> FloatArray:
-    """The Jacobian (3, 3) of the end of a displacement (3,) with respect to the pose where it begins."""
-    x, y, _ = displacement.tolist()
-    return np.array([[1.0, 0.0, -y], [0.0, 1.0, x], [0.0, 0.0, 1.0]])

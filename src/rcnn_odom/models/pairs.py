@@ -2,13 +2,13 @@
 
 import math
 from collections.abc import Iterable
-from dataclasses import replace
+from itertools import pairwise
 from typing import TYPE_CHECKING, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_covariance, unknown_covariance
+from rcnn_odom.geometry import FloatArray, Step, Steps, advance, relative_covariance
 from rcnn_odom.models.encoding import decode
 from rcnn_odom.models.streaming import Network, Registered, Stepper
 from rcnn_odom.recordings.beams import BeamCheck
@@ -105,16 +105,25 @@ class PairTracker:
     def begin(self, scan: Scan) -> tuple[str, ...]:
         """Takes a scan that is not compared with those before; returns notes."""
         notes: list[str] = []
-        depth = self._encode(scan, notes)
+        self.begin_encoded(self._encode(scan, notes))
+        return tuple(notes)
+
+    def begin_encoded(self, depth: npt.NDArray[np.float32]) -> None:
+        """:meth:`begin` for a depth vector (bins,)."""
         self._earlier, self._missed = (depth if depth.any() else None), 0
         self._is_predicted = True
-        return tuple(notes)
 
     def register(self, scan: Scan, periods: int = 1, seconds: float | None = None) -> Registered:
         """The step to one more scan, ``periods`` after the last one; the class lists the notes."""
-        assert self._earlier is not None, "call begin first, until has_seen"
         notes: list[str] = []
-        depth = self._encode(scan, notes)
+        return self.register_encoded(self._encode(scan, notes), periods, notes)
+
+    def register_encoded(
+        self, depth: npt.NDArray[np.float32], periods: int = 1, notes: Iterable[str] = ()
+    ) -> Registered:
+        """:meth:`register` for a depth vector (bins,) and the notes on its scan."""
+        assert self._earlier is not None, "call begin first, until has_seen"
+        notes = list(notes)
         if not depth.any():
             self._missed += periods
             return self._predict(periods, notes)
@@ -196,26 +205,30 @@ class PairTracker:
         return Registered(Step(x, y, heading, covariance + compensation), tuple(notes), is_estimated=False)
 
 
-def estimate_pairs(stepper: Stepper, pairs: Iterable[npt.NDArray[np.float32]]) -> Steps:
-    """The steps of consecutive pairs of encoded scans.
+def estimate_encoded(stepper: Stepper, scans: Iterable[npt.NDArray[np.float32]]) -> Steps:
+    """The steps between consecutive encoded scans, one period apart.
 
-    If a network that measures residual motions fails (nan), the last motion goes on with an unknown
-    covariance; its stepper has reset itself.
+    A network that measures residual motions is used as in a stream: it predicts the steps to scans without
+    returns, and the last motion goes on where it fails. Other networks see all pairs.
 
     Args:
         stepper: the model, without earlier scans.
-        pairs: (2, bins) metres each, of which the first scan is the second scan of the pair before.
+        scans: (bins,) metres each, 0 without a return.
 
     Returns:
-        One step for each pair.
+        One step for each pair of consecutive scans.
     """
-    steps: list[Step] = []
-    for pair in pairs:
-        step = stepper(pair)
-        if stepper.description.warping and not np.isfinite(step.array()).all():
-            last = steps[-1] if steps else Step(0.0, 0.0, 0.0)
-            step = replace(last, covariance=unknown_covariance())
-        steps.append(step)
+    if stepper.description.warping is None:
+        steps = [stepper(np.stack(pair)) for pair in pairwise(scans)]
+    else:
+        tracker, steps = PairTracker(stepper), []
+        for depth in scans:
+            if tracker.has_seen:
+                steps.append(tracker.register_encoded(depth).step)
+            else:
+                tracker.begin_encoded(depth)
+                steps.append(Step(0.0, 0.0, 0.0))
+        steps = steps[1:]
     return Steps(
         np.array([step.array() for step in steps]).reshape(-1, 3),
         np.array([step.covariance for step in steps]).reshape(-1, 3, 3),

@@ -324,7 +324,7 @@ def _draw_lines(nearest, rays, points, positions, joined, turn, is_circle):  # t
                 i -= bins
             if 0 <= i < bins:
                 across = rays[i, 0] * ey - rays[i, 1] * ex
-                if across > 0 and cross < nearest[i] * across:
+                if across > 0 and 0 < cross < nearest[i] * across:
                     nearest[i] = cross / across
 
 

@@ -126,12 +126,12 @@ class TrainedModel(nn.Module, Model):
         """The state before the first pair for B = 1; the keys are its names in an exported file."""
         return {}
 
-    def set_units(self, steps: FloatArray) -> None:
-        """Sets the scales of inputs and outputs from the steps (N, 3) of the training drives.
+    def set_units(self, steps: Sequence[FloatArray]) -> None:
+        """Sets the scales of inputs and outputs from the steps (N, 3) of each training drive.
 
         It is called once before training.
         """
-        self.typical_step.copy_(torch.from_numpy(np.sqrt(np.square(steps).mean(0))))
+        self.typical_step.copy_(torch.from_numpy(np.sqrt(np.square(np.concatenate(steps)).mean(0))))
 
     def take_weights(self, model: "TrainedModel") -> None:
         """Copies the weights of a trained network with the same options, for fine-tuning.

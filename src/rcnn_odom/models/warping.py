@@ -13,10 +13,12 @@ from rcnn_odom.models.motion_filter import MotionFilter, Weighed
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
-LARGEST_CORRECTION = 0.5
-"""Metres; after a larger correction, the measurement is used alone, without the prediction.
+LARGEST_CORRECTION, LARGEST_RATIO = 0.5, 4.0
+"""Metres, and standard deviations. A measured correction that is larger than both refutes the prediction: the
+motion has become another one.
 
-If the last of several corrections is still larger, the network has failed and there is no estimate.
+If corrections do not settle and the last one is still larger than the former, the network has failed and
+there is no estimate.
 """
 
 
@@ -94,6 +96,7 @@ class WarpingStepper:
         """Makes a scan (bins,) the key scan, unless it is the last one that the stepper has seen."""
         if self._last is None or not np.array_equal(scan, self._last):
             self._take_key(scan)  # the first scan, or scans between were not used
+            self._filter.forget_motion()
             self._last = scan.copy()
 
     def _take_key(self, scan: npt.NDArray[np.float32]) -> None:
@@ -129,14 +132,20 @@ class WarpingStepper:
                 return None
             measured = relative_step(expected, advance(pose, residual.array()))
             covariance = turn_covariance(residual.covariance, float(measured[2]) - residual.heading)
+            is_far_off = self._size(residual.array()) > LARGEST_CORRECTION
+            if is_far_off and self._is_certain(residual):
+                self._filter.forget_motion()
             weighed = self._filter.weigh(measured, covariance, periods)
-            last, is_far_off = correction, self._size(residual.array()) > LARGEST_CORRECTION
-            correction = measured if is_far_off else weighed.correction
+            last, correction = correction, weighed.correction
             if self._size(correction - last) < self.warping.settled:
-                break
-        if number and is_far_off:
-            return None  # the corrections do not converge
-        return weighed
+                return weighed
+        return None if number and is_far_off else weighed
+
+    def _is_certain(self, residual: Step) -> bool:
+        """Whether a measured residual motion is much larger than its standard deviations."""
+        motion = residual.array()
+        covariance = residual.covariance + 1e-12 * np.eye(3)  # a network may claim to be exact
+        return bool(motion @ np.linalg.solve(covariance, motion) > LARGEST_RATIO**2)
 
     def _size(self, motion: FloatArray) -> float:
         """Length of a motion (3,) in metres, in which ``radians_a_metre`` of its turn count as one metre."""

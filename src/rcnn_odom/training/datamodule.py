@@ -189,9 +189,9 @@ class OdometryDataModule(L.LightningDataModule):
         if not self.drives:
             self.load()
 
-    def training_steps(self) -> FloatArray:
-        """The steps (N, 3) of the training drives, metres and radians."""
-        return np.concatenate([drive.steps for drive in self.drives["train"]])
+    def training_steps(self) -> list[FloatArray]:
+        """The steps (N, 3) of each training drive, metres and radians."""
+        return [drive.steps for drive in self.drives["train"]]
 
     def train_dataloader(self) -> DataLoader:
         """Shuffled batches of windows: see :class:`rcnn_odom.training.windows.Windows`."""

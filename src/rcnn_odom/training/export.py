@@ -15,7 +15,7 @@ from rcnn_odom.evaluation.scores import coverage, coverage_table, score_all, tab
 from rcnn_odom.geometry import Steps
 from rcnn_odom.models.contract import Stepper
 from rcnn_odom.models.onnx_stepper import OnnxStepper
-from rcnn_odom.models.pairs import PairTracker, estimate_pairs, wrap_for_stream
+from rcnn_odom.models.pairs import PairTracker, estimate_encoded
 from rcnn_odom.models.trained import TrainedModel
 from rcnn_odom.recordings.parts import parse_part
 from rcnn_odom.recordings.recording import Drive
@@ -145,11 +145,10 @@ def _score(
 
 
 def stream_steps(stepper: Stepper, drive: Drive) -> Steps:
-    """Estimates the steps of a drive, one pair of scans after the other."""
-    stepper = wrap_for_stream(stepper)
+    """Estimates the steps of a drive, one scan after the other."""
     stepper.reset()
-    frames = tqdm(range(len(drive) - 1), desc=drive.name, unit="scan", disable=None, leave=False)
-    return estimate_pairs(stepper, (np.array(drive.scans[frame : frame + 2]) for frame in frames))
+    frames = tqdm(range(len(drive)), desc=drive.name, unit="scan", disable=None, leave=False)
+    return estimate_encoded(stepper, (np.array(drive.scans[frame]) for frame in frames))
 
 
 def _check_added_drift(reports: dict[str, Report], precision: str) -> None:

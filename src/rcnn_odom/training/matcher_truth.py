@@ -47,8 +47,9 @@ class MatchedPath(NamedTuple):
 class MatcherTruth:
     """Opens recordings; those without poses get the poses of scan matching.
 
-    Steps that the matcher marks (held, no match, poor match, ...) are not used for training: they are False
-    in ``trusted`` of the recording.
+    Steps that the matcher marks (held, no match, poor match, ...) and the step after each are not used for
+    training: they are False in ``trusted`` of the recording. The step after a marked one takes the error of
+    the pose between them back, since the matcher compares scans with its map.
 
     Args:
         open_recording: function from a name to the recording; poses that scan matching should find are nan.
@@ -69,11 +70,16 @@ class MatcherTruth:
         if not np.isnan(recording.poses).all():
             return recording
         found = self._find(recording)
-        trusted = found.marks == ""
-        marked = int((~trusted[1:]).sum())
+        is_marked = found.marks != ""
+        trusted = ~is_marked
+        trusted[1:] &= ~is_marked[:-1]
+        marked, left_out = (int(which[1:].sum()) for which in (is_marked, ~trusted))
         kinds = Counter(kind for mark in found.marks[1:] for kind in str(mark).split(", ") if kind)
         counts = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
-        note = f"truth: scan matching; {marked} of {len(found.steps)} steps are marked and not trained on"
+        note = (
+            f"truth: scan matching; {marked} of {len(found.steps)} steps are marked, {left_out} with those "
+            "after them are not trained on"
+        )
         return replace(
             recording,
             poses=compose(found.steps),

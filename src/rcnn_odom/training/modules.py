@@ -1,7 +1,7 @@
 """LightningModules: one class trains any model; the four networks of the paper have subclasses."""
 
 import pickle
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, cast
@@ -58,9 +58,9 @@ class OdometryModule(L.LightningModule):
         self.estimates_file: Path | None = None
         self.fingerprint = self.code = ""
 
-    def set_units(self, steps: FloatArray) -> None:
-        """Sets the units of the network from the steps (N, 3) of the training drives, metres and radians."""
-        self.mean_step.copy_(torch.from_numpy(steps.mean(0)))
+    def set_units(self, steps: Sequence[FloatArray]) -> None:
+        """Sets the units of the network from the steps (N, 3) of each training drive, metres and radians."""
+        self.mean_step.copy_(torch.from_numpy(np.concatenate(steps).mean(0)))
         self.model.set_units(steps)
 
     def setup(self, stage: str) -> None:

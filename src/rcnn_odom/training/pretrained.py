@@ -134,7 +134,7 @@ def validation_drift(module: OdometryModule, data: OdometryDataModule) -> float 
 def warn_if_few_data(data: OdometryDataModule) -> None:
     """Warns if the training drives are too short for fine-tuning."""
     scans = sum(map(len, data.drives["train"]))
-    metres = float(np.hypot(*data.training_steps()[:, :2].T).sum())
+    metres = float(sum(np.hypot(*steps[:, :2].T).sum() for steps in data.training_steps()))
     if scans < LEAST_SCANS or metres < LEAST_METRES:
         log.warning(
             "fine-tuning on %d scans and %.0f m is too little data (recommended: %d scans and %.0f m or "
