@@ -138,3 +138,10 @@ def test_a_checkpoint_steps_through_the_same_graph(run):
         np.testing.assert_allclose(pose.step.array(), reference(pair).array(), atol=1e-5)
     with pytest.raises(InputError, match="no such checkpoint"):
         export_job.load_odometer(run / "none.ckpt")
+
+
+def test_a_validation_drive_may_be_a_part_of_a_trained_recording():
+    data = {"train": ["a[:0.8]", "b"], "val": ["a[0.8:]"], "test": ["c"]}
+    export_job._refuse_used_drives(["a[0.8:]", "d"], data)
+    with pytest.raises(InputError, match="--fit-on: a was trained or is tested on"):
+        export_job._refuse_used_drives(["a[0.9:]"], data)

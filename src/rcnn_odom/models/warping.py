@@ -13,13 +13,18 @@ from rcnn_odom.models.motion_filter import MotionFilter, Weighed
 from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
-LARGEST_CORRECTION, LARGEST_RATIO = 0.5, 4.0
-"""Metres, and standard deviations. A measured correction that is larger than both refutes the prediction: the
-motion has become another one.
+LARGEST_CORRECTION = 0.5
+"""Metres; a larger measured correction means that the motion is another one than predicted, if a second
+measurement confirms it. If corrections do not settle and the last one is still larger than this, the network
+has failed and there is no estimate."""
 
-If corrections do not settle and the last one is still larger than the former, the network has failed and
-there is no estimate.
-"""
+PROBED_FROM = 0.03
+"""Metres; a measurement with a larger standard deviation is repeated from another viewpoint."""
+PROBE, LEAST_PROBE, LARGEST_PROBE = 3.0, 0.1, 1.0
+"""Distance of that viewpoint, in standard deviations, and its bounds in metres."""
+LEAST_RESPONSE, FULL_RESPONSE = 0.05, 0.7
+"""Fractions of that distance by which the measurement changes: the least one that is assumed, and the one
+above which the scans tell enough."""
 
 
 class WarpingStepper:
@@ -126,26 +131,67 @@ class WarpingStepper:
             if number:
                 self.network.forget_last()  # the network's state must contain each scan only once
             pose = advance(expected, correction)
-            before = render(self._key, self.description.sensor, pose, self._drawn)
-            residual = self.network(np.stack([before, now]))
+            residual = self._compare(pose, now)
             if not np.isfinite(residual.array()).all():
                 return None
-            measured = relative_step(expected, advance(pose, residual.array()))
-            covariance = turn_covariance(residual.covariance, float(measured[2]) - residual.heading)
             is_far_off = self._size(residual.array()) > LARGEST_CORRECTION
-            if is_far_off and self._is_certain(residual):
-                self._filter.forget_motion()
-            weighed = self._filter.weigh(measured, covariance, periods)
+            unbiased = self._undo_shrinkage(residual, pose, now, is_far_off)
+            if is_far_off and unbiased is residual:
+                self._filter.forget_motion()  # it is another motion than the predicted one
+            weighed = self._weigh(unbiased, pose, expected, periods)
             last, correction = correction, weighed.correction
             if self._size(correction - last) < self.warping.settled:
                 return weighed
         return None if number and is_far_off else weighed
 
-    def _is_certain(self, residual: Step) -> bool:
-        """Whether a measured residual motion is much larger than its standard deviations."""
-        motion = residual.array()
-        covariance = residual.covariance + 1e-12 * np.eye(3)  # a network may claim to be exact
-        return bool(motion @ np.linalg.solve(covariance, motion) > LARGEST_RATIO**2)
+    def _weigh(self, residual: Step, viewpoint: FloatArray, expected: FloatArray, periods: int) -> Weighed:
+        """Weighs a residual motion from a viewpoint (3,) against the expected pose (3,)."""
+        measured = relative_step(expected, advance(viewpoint, residual.array()))
+        covariance = turn_covariance(residual.covariance, float(measured[2]) - residual.heading)
+        return self._filter.weigh(measured, covariance, periods)
+
+    def _compare(self, viewpoint: FloatArray, now: npt.NDArray[np.float32]) -> Step:
+        """The measured residual motion from a viewpoint (3,) in the frame of the key scan."""
+        before = render(self._key, self.description.sensor, viewpoint, self._drawn)
+        return self.network(np.stack([before, now]))
+
+    def _undo_shrinkage(
+        self, residual: Step, viewpoint: FloatArray, now: npt.NDArray[np.float32], is_far_off: bool
+    ) -> Step:
+        """Corrects a measured residual that is too small because the scans tell little.
+
+        Where the scans tell little of the motion along a direction, such as a corridor's, the network gives
+        the mean of likely residuals, which is nearly zero whatever the residual is. As a measurement that
+        would be biased, and over many scans the path would run away. Therefore the comparison is repeated
+        from a viewpoint farther on in that direction. The residual should become smaller by as much. If it
+        becomes smaller by a fraction of that only, residual and deviation are divided by the fraction.
+
+        The state of a recurrent network then contains the second comparison in place of the first.
+
+        Args:
+            residual: measured from the viewpoint.
+            viewpoint: (3,) in the frame of the key scan.
+            now: the rendered scan.
+            is_far_off: whether the residual is so large that it is checked whatever its deviation.
+
+        Returns:
+            The residual itself if it is accurate, or becomes smaller as it should.
+        """
+        variances, directions = np.linalg.eigh(residual.covariance[:2, :2])
+        deviation = math.sqrt(max(float(variances[1]), 0.0)) if np.isfinite(variances).all() else 0.0
+        if deviation < PROBED_FROM and not is_far_off:
+            return residual
+        direction = np.array([*directions[:, 1], 0.0])
+        distance = min(max(PROBE * deviation, LEAST_PROBE), LARGEST_PROBE)
+        self.network.forget_last()
+        farther = self._compare(advance(viewpoint, distance * direction), now)
+        response = float((residual.array() - farther.array()) @ direction) / distance
+        if not response <= FULL_RESPONSE:  # or nan
+            return residual
+        factor = 1 / max(response, LEAST_RESPONSE)
+        stretch = np.eye(3) + (factor - 1) * np.outer(direction, direction)
+        x, y, heading = (stretch @ residual.array()).tolist()
+        return Step(x, y, heading, stretch @ residual.covariance @ stretch)
 
     def _size(self, motion: FloatArray) -> float:
         """Length of a motion (3,) in metres, in which ``radians_a_metre`` of its turn count as one metre."""

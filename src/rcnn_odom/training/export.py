@@ -104,10 +104,14 @@ def load_odometer(checkpoint: str | Path, threads: int = 1) -> Odometer:
 
 
 def _refuse_used_drives(names: list[str], data: Settings) -> None:
-    """Refuses drives of the training or test. Training on NAME includes its new worlds, ``NAME~1`` etc."""
+    """Refuses drives of the training or test. Training on NAME includes its new worlds, ``NAME~1`` etc.
+
+    The validation drives may be parts of recordings that were trained on.
+    """
+    others = [name for name in names if name not in data["val"]]
     used, wanted = (
         {parse_part(name).file.split("~")[0] for name in each}
-        for each in (data["train"] + data["test"], names)
+        for each in (data["train"] + data["test"], others)
     )
     if used_drives := sorted(used & wanted):
         raise InputError(f"--fit-on: {', '.join(used_drives)} was trained or is tested on; name other drives")
