@@ -175,10 +175,12 @@ class WarpingStepper:
             is_far_off: whether the residual is so large that it is checked whatever its deviation.
 
         Returns:
-            The residual itself if it is accurate, or becomes smaller as it should.
+            The residual itself if it is accurate, or becomes smaller as it should, or has no covariance.
         """
+        if not np.isfinite(residual.covariance).all():
+            return residual
         variances, directions = np.linalg.eigh(residual.covariance[:2, :2])
-        deviation = math.sqrt(max(float(variances[1]), 0.0)) if np.isfinite(variances).all() else 0.0
+        deviation = math.sqrt(max(float(variances[1]), 0.0))
         if deviation < PROBED_FROM and not is_far_off:
             return residual
         direction = np.array([*directions[:, 1], 0.0])
