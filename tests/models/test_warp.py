@@ -266,6 +266,22 @@ def test_a_measurement_that_follows_the_motion_by_a_fraction_is_stretched(spied,
     assert np.sqrt(step.covariance[0, 0]) == pytest.approx(0.04 / response, rel=0.03)
 
 
+def test_a_second_comparison_that_fails_confirms_nothing(spied):
+    """The first says 0.4 m to 4 cm, the second nan: the measurement hardly counts."""
+
+    class Failing(Perfect):
+        def __call__(self, pair):
+            step = super().__call__(pair)
+            x = step.x if self.calls == 1 else math.nan
+            return Step(x, step.y, step.heading, np.diag([0.04**2, 1e-6, 1e-8]))
+
+    scans, steps = np.stack([room_scan((x, 0.0, 0.0)) for x in (0.0, 0.4)]), np.array([[0.4, 0.0, 0.0]])
+    network = Failing(scans, steps, Warping(0.5, 1, 0.1, 0.05, 100.0, 20.0))
+    network.description = replace(network.description, typical_step=(0.1, 0.1, 0.1))
+    step = spied(network)(scans)
+    assert step.covariance[0, 0] > 0.15**2  # about the 0.2 m of an unknown motion
+
+
 def test_after_scans_that_were_not_used_the_motion_is_uncertain(spied):
     """Before a wall that tells nothing, the deviation says that the motion may have changed meanwhile."""
     scans, steps = drive(12)

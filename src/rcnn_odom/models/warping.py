@@ -188,9 +188,9 @@ class WarpingStepper:
         self.network.forget_last()
         farther = self._compare(advance(viewpoint, distance * direction), now)
         response = float((residual.array() - farther.array()) @ direction) / distance
-        if not response <= FULL_RESPONSE:  # or nan
+        if response > FULL_RESPONSE:
             return residual
-        factor = 1 / max(response, LEAST_RESPONSE)
+        factor = 1 / max(LEAST_RESPONSE, response)  # in this order: a response of nan confirms nothing
         stretch = np.eye(3) + (factor - 1) * np.outer(direction, direction)
         x, y, heading = (stretch @ residual.array()).tolist()
         return Step(x, y, heading, stretch @ residual.covariance @ stretch)
