@@ -55,6 +55,7 @@ def test_a_run_leaves_everything_behind(trained, kitti, variant):
     assert not (run / LAST).exists()
     for kind in ("trajectory", "motion"):
         assert (run / "figures" / f"05_{kind}.png").stat().st_size > 10_000
+    assert len(list((run / "tensorboard").glob("events*"))) == 1
     assert len(np.loadtxt(run / "trajectories" / "05.txt")) == 60
     root = kitti[0].split("=")[1]
     truth = np.loadtxt(run / "trajectories" / "05_truth.txt")

@@ -54,7 +54,14 @@ from rcnn_odom.training.run_state import (
     write_json,
 )
 from rcnn_odom.training.saving import AtomicCheckpointIO, Best, Saving, Stopped, TimeUp
-from rcnn_odom.training.tensorboard import Dashboard, log_figure, log_results, log_run, log_start
+from rcnn_odom.training.tensorboard import (
+    Dashboard,
+    OneFileLogger,
+    log_figure,
+    log_results,
+    log_run,
+    log_start,
+)
 from rcnn_odom.training.trainer_options import max_time_in_seconds
 from rcnn_odom.training.training_log import TrainingLog
 
@@ -166,7 +173,7 @@ def _training_options(settings: Settings, run: Path) -> Settings:
     saving = Saving(run / LAST, max_time_in_seconds(max_time) if max_time else None)
     decay = settings["model"].get("averaging")
     return {
-        "logger": TensorBoardLogger(run, name="", version="tensorboard", default_hp_metric=False),
+        "logger": OneFileLogger(run, name="", version="tensorboard", default_hp_metric=False),
         "callbacks": [
             *([Averaging(decay)] if decay else []),
             Dashboard(settings),
@@ -269,6 +276,7 @@ def train_module(
     log_results(trainer.logger, settings, metrics)
     if "stopped_by" not in training:
         log_run(trainer.logger, settings, metrics)
+    trainer.logger.experiment.close()
     write_json(run / METRICS, metrics)
     if "stopped_by" in training:
         done = training["epochs"], settings["model"]["epochs"]

@@ -8,6 +8,7 @@ import numpy as np
 import numpy.typing as npt
 from lightning.pytorch.callbacks import Callback
 from lightning.pytorch.loggers import TensorBoardLogger
+from lightning.pytorch.utilities import rank_zero_only
 from tensorboard.compat.proto.event_pb2 import Event, SessionLog
 from torch.utils.tensorboard.summary import hparams, text
 
@@ -128,6 +129,20 @@ def validation_scalars(values: dict[str, float]) -> dict[str, float]:
             place = drive or (ALL_DRIVES if metric in WITH_DRIVES else None)
             scalars[score_tag(VALIDATION, metric, place)] = scale * value
     return scalars
+
+
+class OneFileLogger(TensorBoardLogger):
+    """Keeps the file of a run open from training to scoring.
+
+    Lightning would open a second one for the scores. TensorBoard reads the files of one second in the order
+    of their names, where 10 comes before 9, and then drops the scores as those of an earlier attempt.
+    """
+
+    @rank_zero_only
+    def finalize(self, status: str) -> None:
+        """Lightning's hook after training, validation and test."""
+        if self._experiment is not None:
+            self.experiment.flush()
 
 
 class Dashboard(Callback):
