@@ -101,7 +101,7 @@ class OdometryNode:
         if self.is_upside_down:
             scan = replace(scan, bearings=-scan.bearings)
         pose = self.odometer.step(scan)
-        if (check := self.odometer.beam_check) and check.is_for_good:
+        if (check := self.odometer.beam_check) and check.is_another_laser:
             raise check.refusal("scan", "take model:=matcher, or train a network: python train.py {}")
         if pose.degraded:
             warn(pose.degraded)
