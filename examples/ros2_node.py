@@ -17,6 +17,9 @@ few returns) are logged; a scan that is passed over is not published. The file c
 import math
 from contextlib import suppress
 from dataclasses import replace
+from typing import Any
+
+import numpy as np
 
 from rcnn_odom.cli.full import need_full
 from rcnn_odom.deployment.odometer import Odometer, Pose
@@ -26,7 +29,7 @@ from rcnn_odom.models.tracking import PASSED_OVER
 from rcnn_odom.recordings.rosbag import convert
 
 
-def fill(message, pose: Pose, seconds: float) -> None:
+def fill(message: Any, pose: Pose, seconds: float) -> None:
     """Writes a pose into an Odometry message; ``seconds`` is the duration of its last step."""
     message.pose.pose.position.x, message.pose.pose.position.y = pose.x, pose.y
     message.pose.pose.orientation.z = math.sin(pose.heading / 2)
@@ -38,12 +41,12 @@ def fill(message, pose: Pose, seconds: float) -> None:
     fill_covariance(message.twist.covariance, covariance)
 
 
-def fill_covariance(values, covariance) -> None:
+def fill_covariance(values: Any, covariance: np.ndarray) -> None:
     """Writes a covariance (3, 3) of x, y and yaw into the 36 values of a message."""
     values[:] = ros_covariance(covariance)
 
 
-def read_transform(transform) -> tuple[tuple[float, float, float], bool]:
+def read_transform(transform: Any) -> tuple[tuple[float, float, float], bool]:
     """x, y and yaw of a Transform message, and whether the laser is mounted upside down.
 
     Raises:
@@ -72,7 +75,7 @@ def load(model: str) -> Odometer:
 class OdometryNode:
     """Subscribes to scans and publishes odometry."""
 
-    def __init__(self, node) -> None:
+    def __init__(self, node: Any) -> None:
         from nav_msgs.msg import Odometry
         from rclpy.qos import qos_profile_sensor_data
         from sensor_msgs.msg import LaserScan
@@ -82,16 +85,18 @@ class OdometryNode:
         defaults = {"model": "matcher", "odom_frame": "odom", "base_frame": "", "publish_tf": True}
         values = {name: node.declare_parameter(name, value).value for name, value in defaults.items()}
         self.odom_frame, self.base_frame = values["odom_frame"], values["base_frame"]
-        self.odometer, self.last_stamp, self.is_upside_down = load(values["model"]), None, False
+        self.odometer, self.is_upside_down = load(values["model"]), False
+        self.last_stamp: float | None = None
         self.publisher = node.create_publisher(Odometry, "odom", 10)
         self.broadcaster = TransformBroadcaster(node) if values["publish_tf"] else None
-        self.buffer = Buffer() if self.base_frame else None
+        self.buffer: Any = Buffer() if self.base_frame else None
         self.listener = TransformListener(self.buffer, node) if self.base_frame else None
         node.create_subscription(LaserScan, "scan", self.on_scan, qos_profile_sensor_data)
 
-    def on_scan(self, message) -> None:
+    def on_scan(self, message: Any) -> None:
         """Computes the pose of one scan and publishes it."""
         warn = self.node.get_logger().warning
+        scan: Any  # one of ROS has a stamp and bearings
         try:
             scan = convert(message, self.node.get_clock().now().nanoseconds)
         except ValueError as error:
@@ -120,7 +125,7 @@ class OdometryNode:
         self.odometer = Odometer(self.odometer.tracker, laser_pose)
         return True
 
-    def publish(self, header, pose: Pose, seconds: float) -> None:
+    def publish(self, header: Any, pose: Pose, seconds: float) -> None:
         """Publishes a pose as a message and as a transform."""
         from geometry_msgs.msg import TransformStamped
         from nav_msgs.msg import Odometry
