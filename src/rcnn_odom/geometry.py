@@ -269,12 +269,11 @@ class AccumulatedCovariance:
             return  # the zero step of a scan that was not used
         lasting = step.covariance
         if self._taken_back.any() or step.taken_back.any():
-            before = _propagate(lever_matrix(step.x, step.y), self._taken_back)
-            after = _propagate(rotation_matrix(step.heading), step.taken_back)
-            lasting = _nearest_covariance(lasting - before - after)
+            cancelled = relative_covariance(step, self._taken_back, step.taken_back)
+            lasting = _nearest_covariance(lasting - cancelled)
         self._taken_back = step.taken_back
         self._lasting = _compound(pose[2], self._lasting, step, lasting)
-        self.value = self._lasting + _propagate(rotation_matrix(pose[2] + step.heading), self._taken_back)
+        self.value = self._lasting + turn_covariance(self._taken_back, pose[2] + step.heading)
 
 
 def lever_matrix(x: float, y: float) -> FloatArray:
@@ -361,8 +360,7 @@ def relative_covariance(step: Step, earlier: FloatArray, later: FloatArray) -> F
         >>> relative_covariance(Step(2.0, 0.0, 0.0), earlier, later).diagonal().round(6)
         array([0.  , 0.04, 0.01])
     """
-    turned = _propagate(rotation_matrix(step.heading), later)
-    return _propagate(lever_matrix(step.x, step.y), earlier) + turned
+    return _propagate(lever_matrix(step.x, step.y), earlier) + turn_covariance(later, step.heading)
 
 
 def turn_covariance(covariance: FloatArray, heading: float) -> FloatArray:

@@ -182,6 +182,17 @@ def test_backs_of_walls_are_not_drawn():
     assert reproject(scan, ROUND, [4.0, 0.0, 0.0]).any(), "points have no side"
 
 
+@pytest.mark.parametrize("quarter_turns", range(4))
+def test_a_wall_seen_edge_on_has_no_negative_ranges(quarter_turns):
+    """From a place in the line of the wall, but for rounding errors, it is a point at the middle of a bin."""
+    sensor, rng = Sensor(resolution_deg=1.0), np.random.default_rng(0)
+    sines = np.maximum(np.sin(bearings_of(sensor)), 1e-9)
+    depth = np.where(sines > 1 / 15, 2.0 / sines, 0.0).astype(np.float32)
+    for _ in range(100):
+        place = rng.uniform(-3, 3), 2.0 + 1e-8 * rng.standard_normal(), quarter_turns * np.pi / 2
+        assert (render(depth, sensor, np.array(place), sensor) >= 0).all()
+
+
 def test_no_line_is_drawn_between_two_things():
     scan = see_segments(NOWHERE, HALF, [NEAR, (8.0, -8.0, 8.0, 0.6)])
     drawn = render(scan, HALF, NOWHERE, Sensor(0.1, 180.0, 40.0))

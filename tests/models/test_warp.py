@@ -214,23 +214,33 @@ def test_several_looks_along_a_bare_wall_do_not_add_up(spied):
 
     scans, steps = drive()
     once, often = first_step(1), first_step(6)
-    # It says the same from elsewhere, so that residual and deviation are divided by the least response.
-    share = 0.0101 / (0.0101 + 0.04 / LEAST_RESPONSE**2)
+    # It says the same from elsewhere, so that it tells as good as nothing: what it says and its deviation are
+    # divided by the least response, and the former counts as an error as well.
+    share = 0.0101 / (0.0101 + (0.04 + 0.1**2) / LEAST_RESPONSE**2)
     assert once[0] == pytest.approx(share * 0.1 / LEAST_RESPONSE, rel=0.02)
     assert 0 < often[0] < 1.02 * once[0]
     assert often[2] == pytest.approx(steps[0][2], abs=1e-4)
 
 
-def test_a_network_that_jumps_about_has_no_step():
-    """Corrections that never settle tell that it does not know the place; what it says is not handed on."""
+@pytest.mark.parametrize("confirms", [True, False])
+def test_a_network_that_jumps_about_is_not_believed(confirms):
+    """It says 3 m ahead wherever it looks from; or that and nothing by turns, as if it had been right."""
 
     class Jumping(Perfect):
         def __call__(self, pair):
-            return Step(3.0, 0.0, 0.0, np.eye(3))
+            self.calls += 1
+            return Step(
+                0.0 if confirms and self.calls % 2 == 0 else 3.0, 0.0, 0.0, np.diag([1e-4, 1e-4, 1e-6])
+            )
 
     scans, steps = drive()
     network = Jumping(scans, steps, Warping(0.5, 4, 0.1, 0.05, 0.3, 20.0))
-    assert np.isnan(WarpingStepper(network)(scans[:2]).array()).all()
+    step = WarpingStepper(network)(scans[:2])
+    if confirms:  # corrections that never become small
+        assert np.isnan(step.array()).all()
+    else:  # the motion is still as unknown as at the beginning: its deviation is 2 m
+        assert abs(step.x) < 0.1
+        assert np.sqrt(step.covariance[0, 0]) > 1.9
 
 
 @pytest.mark.parametrize("passes", [5, 6, 7])
@@ -266,20 +276,70 @@ def test_a_measurement_that_follows_the_motion_by_a_fraction_is_stretched(spied,
     assert np.sqrt(step.covariance[0, 0]) == pytest.approx(0.04 / response, rel=0.03)
 
 
-def test_a_second_comparison_that_fails_confirms_nothing(spied):
-    """The first says 0.4 m to 4 cm, the second nan: the measurement hardly counts."""
+def walk_along_x(length, deviations, answer):
+    """Two scans, ``length`` metres apart, and a network whose residuals are changed by ``answer``."""
 
-    class Failing(Perfect):
+    class Changed(Perfect):
         def __call__(self, pair):
-            step = super().__call__(pair)
-            x = step.x if self.calls == 1 else math.nan
-            return Step(x, step.y, step.heading, np.diag([0.04**2, 1e-6, 1e-8]))
+            x, y, heading = answer(self, super().__call__(pair).array()).tolist()
+            return Step(x, y, heading, np.diag(np.square(deviations)))
 
-    scans, steps = np.stack([room_scan((x, 0.0, 0.0)) for x in (0.0, 0.4)]), np.array([[0.4, 0.0, 0.0]])
-    network = Failing(scans, steps, Warping(0.5, 1, 0.1, 0.05, 100.0, 20.0))
-    network.description = replace(network.description, typical_step=(0.1, 0.1, 0.1))
+    scans, steps = np.stack([room_scan((x, 0.0, 0.0)) for x in (0.0, length)]), np.array([[length, 0.0, 0.0]])
+    network = Changed(scans, steps, Warping(0.5, 1, 0.1, 0.05, 100.0, 20.0))
+    network.description = replace(
+        network.description, typical_step=(0.1, 0.1, 0.1), typical_change=(0.02, 0.02, 0.02)
+    )
+    return network, scans
+
+
+def test_a_comparison_that_fails_from_another_viewpoint_is_no_step(spied):
+    """It says 0.4 m to 4 cm, and nan from farther on. Of a recurrent network, the state is nan too."""
+
+    def answer(network, residual):
+        return residual if network.calls == 1 else np.full(3, np.nan)
+
+    network, scans = walk_along_x(0.4, (0.04, 0.001, 1e-4), answer)
+    assert np.isnan(spied(network)(scans).array()).all()
+
+
+@pytest.mark.parametrize("later", [(-0.6, 0.0, 0.0), (0.6, 0.0, 0.0), (9.0, 0.0, 0.0)])
+def test_what_another_viewpoint_contradicts_is_not_believed(spied, later):
+    """It says 0.6 m to a millimetre, and from there something else; the motion is known to 0.2 m: none."""
+
+    def answer(network, residual):
+        return np.array([0.6, 0.0, 0.0] if network.calls == 1 else later)
+
+    network, scans = walk_along_x(0.0, (0.001, 0.001, 1e-4), answer)
     step = spied(network)(scans)
-    assert step.covariance[0, 0] > 0.15**2  # about the 0.2 m of an unknown motion
+    assert abs(step.x) < 0.01
+    assert np.sqrt(step.covariance[0, 0]) == pytest.approx(np.hypot(0.2, 0.02), rel=0.02)
+
+
+def test_a_turn_that_another_viewpoint_contradicts_is_not_believed(spied):
+    """It says 0.2 rad, which is as much as 4 m here, and from there -0.2."""
+
+    def answer(network, residual):
+        return np.array([0.0, 0.0, 0.2 if network.calls == 1 else -0.2])
+
+    network, scans = walk_along_x(0.0, (0.001, 0.001, 1e-4), answer)
+    assert abs(spied(network)(scans).heading) < 0.01
+
+
+def test_both_directions_are_checked(spied):
+    """On open ground the network sees a fifth of the way ahead and of that to the side."""
+
+    class Shrunken(Perfect):
+        def __call__(self, pair):
+            x, y, heading = super().__call__(pair).array().tolist()
+            return Step(0.2 * x, 0.2 * y, heading, np.diag([0.041**2, 0.04**2, 1e-8]))
+
+    scans, steps = np.stack([room_scan((x, x, 0.0)) for x in (0.0, 0.3)]), np.array([[0.3, 0.3, 0.0]])
+    network = Shrunken(scans, steps, Warping(0.5, 3, 0.1, 0.05, 100.0, 20.0))
+    network.description = replace(network.description, typical_step=(1.0, 1.0, 0.1))
+    step = spied(network)(scans)
+    assert (step.x, step.y) == (pytest.approx(0.3, rel=0.03), pytest.approx(0.3, rel=0.03))
+    deviations = np.sqrt(np.diag(step.covariance))[:2]
+    assert deviations == pytest.approx([0.205, 0.2], rel=0.03)
 
 
 def test_after_scans_that_were_not_used_the_motion_is_uncertain(spied):
@@ -694,6 +754,25 @@ def test_a_drive_is_estimated_as_in_a_stream(perfect, empty):
         assert np.allclose(found.covariances, [step.covariance for step in streamed], equal_nan=True)
 
 
+def test_predicted_and_held_steps_of_a_drive(perfect):
+    """The motion goes on to scans without returns; where the network fails, with the typical deviation."""
+    scans, steps = (
+        np.stack([room_scan((0.2 * n, 0.0, 0.0)) for n in range(12)]),
+        np.tile([0.2, 0, 0], (11, 1)),
+    )
+    stepper = perfect(scans, steps)
+    stepper.description = replace(stepper.description, typical_step=(0.3, 0.2, 0.1))
+    stepper.network.poses[10] = np.full(3, np.nan)
+    scans = scans.copy()
+    scans[[5, 6]] = 0.0
+    found = estimate_encoded(stepper, scans)
+    assert np.allclose(found.values, np.tile([0.2, 0, 0], (11, 1)), atol=1e-4)
+    deviations = np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
+    assert (deviations[:4] < 1e-3).all()
+    assert deviations[4, 0] > 0.9  # of the change of the motion, which is not known: a metre
+    assert deviations[9] == pytest.approx([0.3, 0.2, 0.1], rel=1e-3)
+
+
 def test_calibration_scales_the_deviations_and_keeps_no_period(monkeypatch):
     rng = np.random.default_rng(0)
     true = np.array([0.02, 0.01, 0.003])
@@ -710,35 +789,77 @@ def test_calibration_scales_the_deviations_and_keeps_no_period(monkeypatch):
     assert math.isnan(network.describe().period)
 
 
-@pytest.mark.parametrize("claimed", [0.2, 0.05, 0.0125])
-def test_calibration_holds_for_the_steps_that_it_leads_to(spied, monkeypatch, claimed):
-    """The filter follows measurements of a smaller deviation more closely: one factor is not enough."""
-    rng = np.random.default_rng(3)
-    change, noise, count = np.array([0.03, 0.01, 0.003]), np.array([0.05, 0.02, 0.005]), 600
-    steps = np.cumsum(change * rng.standard_normal((count, 3)), 0) * [1, 1, 0.1]
-    drive_of = Drive(
-        "a", "k", np.ones((count + 1, 2), np.float32), compose(steps), np.arange(601.0), FORWARD_CAMERA
-    )
-    network = CNNWarp(OPTIONS, SENSOR)
+CHANGE, NOISE = np.array([0.03, 0.01, 0.003]), np.array([0.05, 0.02, 0.005])
+"""Standard deviations of the change of the motion that a filter assumes, and of the measurements."""
 
-    def estimate(_):
-        motion_filter, values, covariances = MotionFilter(change, np.ones(3)), [], []
-        draws = np.random.default_rng(4)
+
+def a_filtered_drive(change, claimed, seed=4, count=2000):
+    """A drive whose motion changes by ``change``, and a function that estimates its steps with a scale.
+
+    The measurements say that their deviation is that of ``NOISE`` times ``claimed`` / 0.05 and the scale.
+    """
+    rng = np.random.default_rng(3)
+    steps = np.cumsum(change * rng.standard_normal((count, 3)), 0) * [1, 1, 0.1]
+    scans = np.ones((count + 1, 2), np.float32)
+    drive_of = Drive("a", "k", scans, compose(steps), np.arange(count + 1.0), FORWARD_CAMERA)
+
+    def estimate(scale, seed=seed):
+        motion_filter, values, covariances = MotionFilter(CHANGE, np.ones(3)), [], []
+        draws = np.random.default_rng(seed)
         for step in steps:
             expected = motion_filter.displacement()
-            residual = relative_step(expected, step) + noise * draws.standard_normal(3)
-            stated = np.diag(np.square(claimed / 0.05 * noise * network.scale.double().numpy()))
-            weighed = motion_filter.weigh(residual, stated)
+            residual = relative_step(expected, step) + NOISE * draws.standard_normal(3)
+            weighed = motion_filter.weigh(residual, np.diag(np.square(claimed / 0.05 * NOISE * scale)))
             covariances.append(motion_filter.correct(weighed)[0])
             values.append(advance(expected, weighed.correction))
             motion_filter.take_key()
         return Steps(np.array(values), np.array(covariances))
 
-    monkeypatch.setattr(network, "estimate", estimate)
+    return drive_of, estimate
+
+
+@pytest.mark.parametrize("claimed", [0.2, 0.05, 0.0125])
+def test_calibration_holds_for_the_steps_that_it_leads_to(monkeypatch, claimed):
+    """The filter follows measurements of a smaller deviation more closely: one factor is not enough."""
+    drive_of, estimate = a_filtered_drive(CHANGE, claimed)
+    network = CNNWarp(OPTIONS, SENSOR)
+    monkeypatch.setattr(network, "estimate", lambda _: estimate(network.scale.double().numpy()))
     network.calibrate([drive_of])
-    found = estimate(drive_of)
+    found = estimate(network.scale.double().numpy(), seed=5)  # of another noise
     ratios = np.abs(found.values - drive_of.steps) / np.sqrt(np.diagonal(found.covariances, axis1=1, axis2=2))
     assert (ratios < 1).mean(0) == pytest.approx(0.6827, abs=0.05)
+
+
+@pytest.mark.parametrize("times", [2.0, 4.0])
+def test_calibration_does_not_run_away_where_the_motion_is_another(monkeypatch, times):
+    """It changes more than in training, so that the steps become worse with a larger deviation."""
+    drive_of, estimate = a_filtered_drive(times * CHANGE, 0.05)
+    network = CNNWarp(OPTIONS, SENSOR)
+    monkeypatch.setattr(network, "estimate", lambda _: estimate(network.scale.double().numpy()))
+    network.calibrate([drive_of])
+    calibrated, not_calibrated = (
+        np.sqrt(np.mean((estimate(scale).values - drive_of.steps)[:, 0] ** 2))
+        for scale in (network.scale.double().numpy(), np.ones(3))
+    )
+    assert calibrated < 2 * not_calibrated
+
+
+def test_calibration_does_not_count_scans_without_returns(monkeypatch):
+    """Half of the steps are predicted, ten times more accurately than they say."""
+    rng = np.random.default_rng(0)
+    scans, steps = np.ones((1001, SENSOR.bins), np.float32), rng.normal(0, 0.1, (1000, 3))
+    scans[2::2] = 0.0
+    errors = 0.02 * rng.standard_normal((1000, 3))
+    errors[1::2] /= 10
+    network = CNNWarp(OPTIONS, SENSOR)
+
+    def estimate(drive):
+        scale = network.scale.double().numpy()
+        return Steps(steps + errors, np.tile(np.diag(np.square(0.01 * scale)), (1000, 1, 1)))
+
+    monkeypatch.setattr(network, "estimate", estimate)
+    network.calibrate([Drive("a", "k", scans, compose(steps), np.arange(1001.0), FORWARD_CAMERA)])
+    assert network.scale.numpy() == pytest.approx(np.full(3, 2.0), rel=0.1)
 
 
 def test_pairs_that_do_not_share_their_scans_are_refused():

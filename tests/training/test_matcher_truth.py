@@ -55,8 +55,8 @@ def test_marked_steps_are_counted_and_not_trusted(folder, tmp_path):
     left_out = int((~opened.trusted[1:]).sum())
     note = next(note for note in opened.notes if note.startswith("truth: scan matching"))
     assert re.fullmatch(
-        rf"truth: scan matching; 1\d of 69 steps are marked, {left_out} with those after them are not "
-        r"trained on \(.*\b10 no returns\b.*\)",
+        rf"truth: scan matching; 1\d of 69 steps are marked; these and the steps after them, {left_out} in "
+        r"all, are not trained on \(.*\b10 no returns\b.*\)",
         note,
     )
 

@@ -57,8 +57,9 @@ ROUNDING = 1e-6
 """Relative rounding error of a matrix entry in fp32."""
 LIKELIHOOD_WEIGHT = 0.05
 """Weight of the likelihood in the loss; the covariances are learned from it."""
-FITS, FITTED = 6, 0.03
-"""The scale of the covariances is fitted so many times at most, until it changes by less than this."""
+FITS, FITTED, CONVERGING = 8, 0.03, 0.9
+"""The scale of the covariances is fitted so many times at most, until the logarithm of its correction is
+smaller than the second value, and only while a correction is smaller than this fraction of the one before."""
 REST_FRACTION = 0.1
 """Fraction of the training guesses that assume no motion, as at the beginning of a drive."""
 LARGEST_REST_DISTANCE, LARGEST_REST_TURN = 3.0, 0.35
@@ -359,30 +360,43 @@ class ResidualNetwork(TrainedModel):
     def calibrate(self, drives: Sequence[Drive]) -> None:
         """Also fits ``scale``, so that 68.27 % of the errors lie within one standard deviation.
 
-        Since it also changes how much of a measurement the filter believes, it is fitted again with the steps
-        that it leads to.
+        The scale also changes how much of a measurement the filter believes, so it is fitted again with the
+        steps that it leads to. Where that does not converge, because the drives move otherwise than
+        ``typical_change`` says, the best scale so far is kept.
 
         ``period`` remains nan, because residual motions can be measured at any rate of scans.
         """
         super().calibrate(drives)
         self.period.fill_(torch.nan)
         self.scale.fill_(1.0)
+        best, smallest = self.scale.clone(), math.inf
         for _ in range(FITS):
-            estimates = [self.estimate(drive) for drive in drives]
-            errors = np.concatenate(
-                [each.values - drive.steps for each, drive in zip(estimates, drives, strict=True)]
-            )
-            variances = np.concatenate(
-                [np.diagonal(each.covariances, axis1=1, axis2=2) for each in estimates]
-            )
-            known = np.isfinite(errors).all(1) & np.isfinite(variances).all(1)
-            if not known.any():
-                return
-            ratios = np.abs(errors[known]) / np.sqrt(variances[known])
-            factor = np.maximum(np.quantile(ratios, WITHIN_DEVIATION, axis=0), 1e-3)
+            factor = self._find_correction(drives)
+            size = float(np.abs(np.log(factor)).max())
+            if size > CONVERGING * smallest:
+                break
+            best, smallest = self.scale.clone(), size
+            if size < FITTED:
+                break
             self.scale.mul_(torch.from_numpy(factor).float())
-            if np.abs(np.log(factor)).max() < FITTED:
-                return
+        self.scale.copy_(best)
+
+    def _find_correction(self, drives: Sequence[Drive]) -> FloatArray:
+        """Factors (3,) by which ``scale`` is too small for the errors of the present steps; 1 if unknown.
+
+        Steps to scans without returns are not counted, because they are predicted, not measured.
+        """
+        ratios = []
+        for drive in drives:
+            steps = self.estimate(drive)
+            deviations = np.sqrt(np.diagonal(steps.covariances, axis1=1, axis2=2))
+            with np.errstate(invalid="ignore"):
+                errors = np.abs(steps.values - drive.steps) / deviations
+            ratios.append(errors[np.isfinite(errors).all(1) & drive.scans[1:].any(1)])
+        counted = np.concatenate(ratios)
+        if not len(counted):
+            return np.ones(3)
+        return np.maximum(np.quantile(counted, WITHIN_DEVIATION, axis=0), 1e-3)
 
     def compare_residuals(self, motion: Tensor, matrix: Tensor, truth: Tensor) -> dict[str, Tensor]:
         """The loss of estimated residual motions.

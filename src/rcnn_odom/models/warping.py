@@ -14,17 +14,17 @@ from rcnn_odom.models.reprojection import render
 from rcnn_odom.models.streaming import Network
 
 LARGEST_CORRECTION = 0.5
-"""Metres; a larger measured correction means that the motion is another one than predicted, if a second
-measurement confirms it. If corrections do not settle and the last one is still larger than this, the network
-has failed and there is no estimate."""
+"""Metres; a larger measured correction means that the motion is another one than predicted, if a comparison
+from where it leads confirms it. If corrections do not settle and the last one is still larger than this, the
+network has failed and there is no estimate."""
 
-PROBED_FROM = 0.03
-"""Metres; a measurement with a larger standard deviation is repeated from another viewpoint."""
-PROBE, LEAST_PROBE, LARGEST_PROBE = 3.0, 0.1, 1.0
-"""Distance of that viewpoint, in standard deviations, and its bounds in metres."""
-LEAST_RESPONSE, FULL_RESPONSE = 0.05, 0.7
-"""Fractions of that distance by which the measurement changes: the least one that is assumed, and the one
-above which the scans tell enough."""
+CHECKED_FROM = 0.03
+"""Metres; a measurement is checked along each direction in which its standard deviation is larger."""
+SHIFT, LEAST_SHIFT, LARGEST_SHIFT = 3.0, 0.1, 1.0
+"""How far the viewpoint is moved for that, in standard deviations, and the bounds of it in metres."""
+LEAST_RESPONSE, FULL_RESPONSE, LARGEST_RESPONSE = 0.05, 0.7, 1.5
+"""Fractions of that shift by which the measurement changes. Between the last two, it is confirmed; between
+the first two, it is divided by the fraction. Otherwise it tells nothing."""
 
 
 class WarpingStepper:
@@ -135,10 +135,14 @@ class WarpingStepper:
             if not np.isfinite(residual.array()).all():
                 return None
             is_far_off = self._size(residual.array()) > LARGEST_CORRECTION
-            unbiased = self._undo_shrinkage(residual, pose, now, is_far_off)
-            if is_far_off and unbiased is residual:
+            checked = self._check(residual, [residual.array()] if is_far_off else [], pose, now)
+            if checked is residual:
+                checked = self._check(residual, find_doubtful_shifts(residual), pose, now)
+            if checked is None:
+                return None
+            if is_far_off and checked is residual:
                 self._filter.forget_motion()  # it is another motion than the predicted one
-            weighed = self._weigh(unbiased, pose, expected, periods)
+            weighed = self._weigh(checked, pose, expected, periods)
             last, correction = correction, weighed.correction
             if self._size(correction - last) < self.warping.settled:
                 return weighed
@@ -151,51 +155,79 @@ class WarpingStepper:
         return self._filter.weigh(measured, covariance, periods)
 
     def _compare(self, viewpoint: FloatArray, now: npt.NDArray[np.float32]) -> Step:
-        """The measured residual motion from a viewpoint (3,) in the frame of the key scan."""
+        """The measured residual motion from a viewpoint (3,), which is given in the frame of the key scan."""
         before = render(self._key, self.description.sensor, viewpoint, self._drawn)
         return self.network(np.stack([before, now]))
 
-    def _undo_shrinkage(
-        self, residual: Step, viewpoint: FloatArray, now: npt.NDArray[np.float32], is_far_off: bool
-    ) -> Step:
-        """Corrects a measured residual that is too small because the scans tell little.
+    def _check(
+        self, residual: Step, shifts: list[FloatArray], viewpoint: FloatArray, now: npt.NDArray[np.float32]
+    ) -> Step | None:
+        """Checks a measured residual by comparisons from other viewpoints, and corrects it by what they tell.
 
         Where the scans tell little of the motion along a direction, such as a corridor's, the network gives
         the mean of likely residuals, which is nearly zero whatever the residual is. As a measurement that
-        would be biased, and over many scans the path would run away. Therefore the comparison is repeated
-        from a viewpoint farther on in that direction. The residual should become smaller by as much. If it
-        becomes smaller by a fraction of that only, residual and deviation are divided by the fraction.
+        would be biased, and over many scans the path would run away. From a viewpoint that is farther on by a
+        shift, the residual should be smaller by the shift. If it becomes smaller by a fraction of that only,
+        residual and deviation are divided by the fraction.
 
-        The state of a recurrent network then contains the second comparison in place of the first.
+        The state of a recurrent network then contains the last comparison in place of the first.
 
         Args:
             residual: measured from the viewpoint.
+            shifts: (3,) motions from that viewpoint to the others, in metres and radians.
             viewpoint: (3,) in the frame of the key scan.
             now: the rendered scan.
-            is_far_off: whether the residual is so large that it is checked whatever its deviation.
 
         Returns:
-            The residual itself if it is accurate, or becomes smaller as it should, or has no covariance.
+            The residual itself if all comparisons confirm it; None if one of them fails.
         """
-        if not np.isfinite(residual.covariance).all():
+        units = np.array([1.0, 1.0, self.warping.radians_a_metre])
+        motion, covariance = residual.array() / units, residual.covariance / np.outer(units, units)
+        is_confirmed = True
+        for shift in shifts:
+            self.network.forget_last()
+            farther = self._compare(advance(viewpoint, shift), now).array()
+            if not np.isfinite(farther).all():
+                return None
+            length = float(np.linalg.norm(shift / units))
+            direction = shift / units / length
+            response = float((residual.array() - farther) / units @ direction) / length
+            if FULL_RESPONSE < response < LARGEST_RESPONSE:
+                continue
+            is_confirmed, along = False, np.outer(direction, direction)
+            is_told = LEAST_RESPONSE < response <= FULL_RESPONSE
+            stretch = np.eye(3) + ((1 / response if is_told else 1 / LEAST_RESPONSE) - 1) * along
+            motion, covariance = stretch @ motion, stretch @ covariance @ stretch
+            if not is_told:  # Its deviation alone could be too small, however it is stretched.
+                covariance = covariance + float(motion @ direction) ** 2 * along
+        if is_confirmed:
             return residual
-        variances, directions = np.linalg.eigh(residual.covariance[:2, :2])
-        deviation = math.sqrt(max(float(variances[1]), 0.0))
-        if deviation < PROBED_FROM and not is_far_off:
-            return residual
-        direction = np.array([*directions[:, 1], 0.0])
-        distance = min(max(PROBE * deviation, LEAST_PROBE), LARGEST_PROBE)
-        self.network.forget_last()
-        farther = self._compare(advance(viewpoint, distance * direction), now)
-        response = float((residual.array() - farther.array()) @ direction) / distance
-        if response > FULL_RESPONSE:
-            return residual
-        factor = 1 / max(LEAST_RESPONSE, response)  # in this order: a response of nan confirms nothing
-        stretch = np.eye(3) + (factor - 1) * np.outer(direction, direction)
-        x, y, heading = (stretch @ residual.array()).tolist()
-        return Step(x, y, heading, stretch @ residual.covariance @ stretch)
+        x, y, heading = (motion * units).tolist()
+        return Step(x, y, heading, covariance * np.outer(units, units))
 
     def _size(self, motion: FloatArray) -> float:
         """Length of a motion (3,) in metres, in which ``radians_a_metre`` of its turn count as one metre."""
         x, y, heading = motion.tolist()
         return math.hypot(x, y, heading / self.warping.radians_a_metre)
+
+
+def find_doubtful_shifts(residual: Step) -> list[FloatArray]:
+    """Shifts of the viewpoint along the directions in which a measured residual is inaccurate.
+
+    Returns:
+        At most two shifts (3,) in metres and radians, at right angles to each other; none if the residual has
+        no covariance.
+
+    Example:
+        >>> wall_ahead = Step(0.0, 0.0, 0.0, np.diag([0.001, 0.1, 0.001]) ** 2)
+        >>> np.abs(find_doubtful_shifts(wall_ahead)).round(3).tolist()
+        [[0.0, 0.3, 0.0]]
+    """
+    if not np.isfinite(residual.covariance).all():
+        return []
+    variances, directions = np.linalg.eigh(residual.covariance[:2, :2])
+    return [
+        np.array([*(min(max(SHIFT * math.sqrt(variance), LEAST_SHIFT), LARGEST_SHIFT) * direction), 0.0])
+        for variance, direction in zip(variances.tolist(), directions.T, strict=True)
+        if variance > CHECKED_FROM**2
+    ]

@@ -77,8 +77,8 @@ class MatcherTruth:
         kinds = Counter(kind for mark in found.marks[1:] for kind in str(mark).split(", ") if kind)
         counts = ", ".join(f"{count} {kind}" for kind, count in kinds.most_common())
         note = (
-            f"truth: scan matching; {marked} of {len(found.steps)} steps are marked, {left_out} with those "
-            "after them are not trained on"
+            f"truth: scan matching; {marked} of {len(found.steps)} steps are marked; these and the steps "
+            f"after them, {left_out} in all, are not trained on"
         )
         return replace(
             recording,
