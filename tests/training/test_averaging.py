@@ -10,6 +10,7 @@ import pytest
 import torch
 from test_saving import assert_same, kill_after, result_of
 
+from conftest import configure_in
 from rcnn_odom.errors import InputError
 from rcnn_odom.evaluation.run_folder import BEST, LAST
 from rcnn_odom.training import averaging, saving, stages
@@ -173,13 +174,22 @@ class KeepingAverages(Averaging):
         torch.save((own, average), folder / f"{trainer.current_epoch}-of-{trainer.global_rank}.pt")
 
 
+@pytest.fixture(scope="module")
+def of_two_processes(kitti, tmp_path_factory):
+    """Options of a training, and the folder of one that nobody has stopped.
+
+    The validation has one drive, so that there is nothing to do in it for one of the two.
+    """
+    options, folder = ["model=cnn_cls", *kitti, "trainer=ddp", AVERAGED], tmp_path_factory.mktemp("two")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "Averaging", KeepingAverages)
+        train(configure_in(folder)(*options))
+    return options, folder / "outputs" / "run"
+
+
 @pytest.mark.slow
-def test_all_processes_have_the_same_average(configure, kitti, tmp_path, monkeypatch):
-    """The validation has one drive, so that there is nothing to do in it for one of the two."""
-    monkeypatch.setattr(stages, "Averaging", KeepingAverages)
-    options = ["model=cnn_cls", *kitti, "trainer=ddp", AVERAGED]
-    train(configure(*options))
-    folder = (tmp_path / "outputs" / "run" / BEST).parent
+def test_all_processes_have_the_same_average(of_two_processes):
+    folder = (of_two_processes[1] / BEST).parent
     for epoch in range(2):
         (own, average), (own_too, average_too) = (
             torch.load(folder / f"{epoch}-of-{rank}.pt", weights_only=True) for rank in range(2)
@@ -192,13 +202,12 @@ def test_all_processes_have_the_same_average(configure, kitti, tmp_path, monkeyp
 
 
 @pytest.mark.slow
-def test_processes_whose_time_is_up_go_on_bit_for_bit(configure, kitti, tmp_path):
-    options = ["model=cnn_cls", *kitti, "trainer=ddp", AVERAGED]
+def test_processes_whose_time_is_up_go_on_bit_for_bit(configure, of_two_processes, tmp_path):
+    options, whole = of_two_processes
     metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
     assert metrics["training"]["steps"] == 1
     train(configure(*options))
-    train(configure(*options, run="whole"))
-    assert_same(*(result_of(tmp_path / "outputs" / name) for name in ("run", "whole")))
+    assert_same(result_of(tmp_path / "outputs" / "run"), result_of(whole))
 
 
 def test_a_killed_training_goes_on_by_its_fingerprint(configure, kitti, tmp_path, monkeypatch):

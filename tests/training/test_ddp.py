@@ -12,7 +12,7 @@ import torch
 from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 from test_experiment import STUB
 
-from conftest import LENGTHS, ROOT, SMALL
+from conftest import LENGTHS, ROOT, SMALL, configure_in
 from data.make_kitti import make_kitti
 from evaluate import evaluate
 from rcnn_odom.errors import InputError
@@ -133,17 +133,18 @@ def test_processes_share_every_batch(start):
         assert len(one) == len(other) == 2
 
 
-def start(uneven, outputs, epochs):
-    options = [
-        *SMALL,
-        *uneven,
-        "model=cnn_cls",
-        "trainer=ddp",
-        "model.batch_size=2",
-        f"model.epochs={epochs}",
-    ]
+@pytest.fixture(scope="module")
+def whole(uneven, tmp_path_factory):
+    """Options of a training, and the weights that it gives when nobody stops it."""
+    options = ["model=cnn_cls", *uneven, "trainer=ddp", "model.batch_size=2", "model.epochs=3"]
+    folder = tmp_path_factory.mktemp("whole")
+    train(configure_in(folder)(*options))
+    return options, torch.load(folder / "outputs" / "run" / BEST, weights_only=True)["state_dict"]
+
+
+def start(options, outputs):
     return subprocess.Popen(
-        [sys.executable, str(ROOT / "train.py"), *options, f"outputs={outputs}"],
+        [sys.executable, str(ROOT / "train.py"), *SMALL, *options, f"outputs={outputs}"],
         cwd=outputs.parent,
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
@@ -159,9 +160,10 @@ def saved(outputs, which):
 
 @pytest.mark.parametrize("everyone", [False, True])
 @pytest.mark.slow
-def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, everyone):
+def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(whole, tmp_path, everyone):
     """By SIGTERM to the process that was started, or by Ctrl-C, which all in the terminal get."""
-    process = start(uneven, tmp_path / "stopped", 3)
+    options, weights = whole
+    process = start(options, tmp_path / "stopped")
     for line in process.stdout:
         if line.startswith("epoch  1/"):
             break
@@ -177,27 +179,22 @@ def test_asked_to_stop_processes_save_and_go_on_bit_for_bit(uneven, tmp_path, ev
     step = saved(tmp_path / "stopped", LAST)["global_step"]
     if everyone:  # what follows is the same
         return
-    text, _ = start(uneven, tmp_path / "stopped", 3).communicate(timeout=200)
+    text, _ = start(options, tmp_path / "stopped").communicate(timeout=200)
     assert f"step {step}\n" in text
-    start(uneven, tmp_path / "whole", 3).communicate(timeout=200)
-    one, other = (saved(tmp_path / name, BEST)["state_dict"] for name in ("stopped", "whole"))
-    assert all(torch.equal(value, other[name]) for name, value in one.items())
+    found = saved(tmp_path / "stopped", BEST)["state_dict"]
+    assert all(torch.equal(value, found[name]) for name, value in weights.items())
 
 
 @pytest.mark.slow
-def test_processes_whose_time_is_up_are_scored_and_go_on_bit_for_bit(configure, uneven, tmp_path):
-    options = ["model=cnn_cls", *uneven, "trainer=ddp", "model.batch_size=4", "model.epochs=1"]
+def test_processes_whose_time_is_up_are_scored_and_go_on_bit_for_bit(configure, whole, tmp_path):
+    options, weights = whole
     metrics = train(configure(*options, "+trainer.max_time={milliseconds: 1}"))
     assert metrics["training"]["steps"] == 1
     assert metrics["training"]["stopped_by"] == "trainer.max_time"
     assert metrics["test"]["sequences"]["05"]["frames"] == 80
     train(configure(*options))
-    train(configure(*options, run="whole"))
-    one, other = (
-        torch.load(tmp_path / "outputs" / run / BEST, weights_only=True)["state_dict"]
-        for run in ("run", "whole")
-    )
-    assert all(torch.equal(value, other[name]) for name, value in one.items())
+    found = torch.load(tmp_path / "outputs" / "run" / BEST, weights_only=True)["state_dict"]
+    assert all(torch.equal(value, found[name]) for name, value in weights.items())
 
 
 @pytest.mark.slow

@@ -105,6 +105,16 @@ def assert_equal(one, other):
     assert all(torch.equal(value, other[name]) for name, value in one.items())
 
 
+@pytest.fixture(scope="module")
+def whole(uneven, tmp_path_factory):  # noqa: F811
+    """Options of a training, and the folder of one by two nodes that nobody has stopped."""
+    options = ["model=cnn_cls", *uneven, "model.batch_size=2", "model.epochs=3"]
+    folder = tmp_path_factory.mktemp("whole")
+    texts, statuses = ends(start(folder, options))
+    assert statuses == [0, 0], texts
+    return options, folder
+
+
 # --- what is trained -----------------------------------------------------------------------------
 
 
@@ -146,20 +156,18 @@ def test_two_nodes_score_as_one_process_and_log_once(configure, uneven, tmp_path
 
 
 @pytest.mark.slow
-def test_two_nodes_train_what_two_own_processes_do_and_score_together(configure, uneven, tmp_path):  # noqa: F811
-    options = ["model=cnn_cls", *uneven]
-    texts, statuses = ends(start(tmp_path, options))
-    assert statuses == [0, 0], texts
-    own = train(configure(*options, "trainer=ddp", f"outputs={tmp_path}/own", f"run_dir={tmp_path}/own/run"))
-    own_weights = torch.load(tmp_path / "own" / "run" / BEST, weights_only=True)["state_dict"]
-    assert_equal(weights_of(tmp_path), own_weights)
+def test_two_nodes_train_what_two_own_processes_do_and_score_together(configure, whole, tmp_path):
+    options, nodes = whole
+    own = train(configure(*options, "trainer=ddp", run="own"))
+    own_weights = torch.load(tmp_path / "outputs" / "own" / BEST, weights_only=True)["state_dict"]
+    assert_equal(weights_of(nodes), own_weights)
 
     port = free_port()
     command = [str(ROOT / "evaluate.py"), "trainer=ddp", "trainer.accelerator=cpu", "run_dir=evaluations/two"]
-    texts, statuses = ends([run(command, tmp_path, as_torchrun(rank, port)) for rank in (0, 1)])
+    texts, statuses = ends([run(command, nodes, as_torchrun(rank, port)) for rank in (0, 1)])
     assert statuses == [0, 0], texts
     assert texts[1] == ""
-    scores = read_metrics_file(tmp_path / "evaluations" / "two")
+    scores = read_metrics_file(nodes / "evaluations" / "two")
     assert scores["test"]["drift"] == pytest.approx(own["test"]["drift"], abs=1e-6)
 
 
@@ -188,16 +196,6 @@ def test_a_job_of_slurm_with_one_task_starts_its_own_processes(uneven, tmp_path)
 # --- stopped and killed --------------------------------------------------------------------------
 
 
-@pytest.fixture(scope="module")
-def whole(uneven, tmp_path_factory):  # noqa: F811
-    """Options of a training, and the weights that it gives when nobody stops it."""
-    options = ["model=cnn_cls", *uneven, "model.batch_size=2", "model.epochs=3"]
-    folder = tmp_path_factory.mktemp("whole")
-    texts, statuses = ends(start(folder, options))
-    assert statuses == [0, 0], texts
-    return options, weights_of(folder)
-
-
 def wait_for_first_epoch(process):
     for line in process.stdout:
         if line.startswith("epoch  1/"):
@@ -208,7 +206,7 @@ def wait_for_first_epoch(process):
 @pytest.mark.slow
 @pytest.mark.parametrize("killed", [0, 1])
 def test_after_a_kill_both_end_and_the_same_command_goes_on_bit_for_bit(whole, tmp_path, killed):
-    options, weights = whole
+    options, unstopped = whole
     processes = start(tmp_path, options)
     wait_for_first_epoch(processes[0])
     processes[killed].kill()
@@ -223,12 +221,12 @@ def test_after_a_kill_both_end_and_the_same_command_goes_on_bit_for_bit(whole, t
     texts, statuses = ends(start(tmp_path, options))
     assert statuses == [0, 0], texts
     assert texts[0].count("continuing from") == 1
-    assert_equal(weights_of(tmp_path), weights)
+    assert_equal(weights_of(tmp_path), weights_of(unstopped))
 
 
 @pytest.mark.slow
 def test_asked_to_stop_one_all_save_and_go_on_bit_for_bit(whole, tmp_path):
-    options, weights = whole
+    options, unstopped = whole
     processes = start(tmp_path, options)
     wait_for_first_epoch(processes[0])
     processes[1].terminate()
@@ -239,7 +237,7 @@ def test_asked_to_stop_one_all_save_and_go_on_bit_for_bit(whole, tmp_path):
     texts, statuses = ends(start(tmp_path, options))
     assert statuses == [0, 0], texts
     assert f"step {step}\n" in texts[0]
-    assert_equal(weights_of(tmp_path), weights)
+    assert_equal(weights_of(tmp_path), weights_of(unstopped))
 
 
 # --- mistakes ------------------------------------------------------------------------------------
