@@ -179,8 +179,10 @@ class WarpingStepper:
             now: the rendered scan.
 
         Returns:
-            The residual itself if all comparisons confirm it; None if one of them fails.
+            The residual itself if all comparisons confirm it, or there are none; None if one of them fails.
         """
+        if not shifts:
+            return residual  # as for nearly all scans, which should not wait for what follows
         units = np.array([1.0, 1.0, self.warping.radians_a_metre])
         motion, covariance = residual.array() / units, residual.covariance / np.outer(units, units)
         is_confirmed = True
